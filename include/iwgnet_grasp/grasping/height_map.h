@@ -1,0 +1,34 @@
+// Heights of the surface over the table, measured from a depth image.
+#pragma once
+
+#include <opencv2/core.hpp>
+
+#include "iwgnet_grasp/core/cell_config.h"
+
+namespace iwgnet_grasp::grasping {
+
+class HeightMap {
+ public:
+  // Empty map: everything at z = 0.
+  HeightMap() = default;
+  // depth: CV_32FC1 m, NaN invalid; the highest point of each cell counts; cells without any
+  // measurement take the highest of their measured neighbours. Points outside the workspace
+  // rectangle (widened by `border`) are left out.
+  HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,
+            const CellConfig& cell, double resolution = 0.002, double border = 0.05);
+
+  double at(double x, double y) const;  // m above base_link's z = 0; 0 outside the map
+  // Highest value within an oriented rectangle: centre, yaw, half extents (m).
+  double max_in(const Eigen::Vector2d& center, double yaw, const Eigen::Vector2d& half) const;
+
+  const cv::Mat& grid() const { return grid_; }  // CV_32FC1, row = y, column = x
+  Eigen::Vector2d origin() const { return origin_; }  // of cell (0, 0), m
+  double resolution() const { return resolution_; }
+
+ private:
+  cv::Mat grid_;
+  Eigen::Vector2d origin_{0, 0};
+  double resolution_ = 0.002;
+};
+
+}  // namespace iwgnet_grasp::grasping

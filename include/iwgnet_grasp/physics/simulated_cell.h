@@ -1,0 +1,76 @@
+// The whole simulated cell: physics, controllers, camera and judge behind one door. It is what the
+// simulator node serves over ROS and what in-process trials and data generation drive directly.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <opencv2/core.hpp>
+#include <string>
+#include <vector>
+
+#include "iwgnet_grasp/motion/pick_and_place.h"
+#include "iwgnet_grasp/physics/controllers.h"
+#include "iwgnet_grasp/physics/judge.h"
+#include "iwgnet_grasp/physics/scene.h"
+#include "iwgnet_grasp/sensing/stereo_depth.h"
+
+namespace iwgnet_grasp::physics {
+
+class SimulatedCell {
+ public:
+  // package_dir: the checkout (urdf/, config/, assets/). config_dir empty: package_dir/config.
+  explicit SimulatedCell(const std::string& package_dir, const std::string& config_dir = "");
+  ~SimulatedCell();
+
+  const CellConfig& config() const;
+
+  // Arm to the observing pose, time to 0, judge reset. An empty name leaves the table bare.
+  // Returns the number of parts. Throws Error for an unknown scene.
+  int load_scene(const std::string& scene, std::uint64_t seed);
+  void step(int steps = 1);  // controllers, physics, judge
+  double time() const;
+  double timestep() const;
+
+  // Driver side.
+  ArmState arm() const;
+  GripperState gripper() const;
+  TrajectoryController& arm_controller();
+  std::string start_trajectory(const motion::Trajectory& trajectory,
+                               const TrajectoryTolerances& tolerances);
+  void command_gripper(double gap, double force);
+  GripperStatus gripper_status() const;
+  double commanded_gap() const;
+
+  // Camera. Noise is drawn from the scene's seed and the number of frames taken since.
+  cv::Mat color();          // CV_8UC3 RGB
+  cv::Mat depth();          // CV_32FC1 m, depth frame, NaN invalid
+  cv::Mat aligned_depth(const cv::Mat& depth) const;  // in the colour frame
+
+  // Ground truth: for the judge, for labels and for pictures only.
+  World& world();
+  sensing::Renderer& renderer();          // poses brought up to date by sync_renderer()
+  void sync_renderer();
+  int part_instance(int part) const;      // renderer handle of a part
+  const std::vector<PartModel>& models() const;
+  void set_light(const sensing::Light& light);
+  void set_part_material(int part, const sensing::Material& material);
+  Verdict verdict() const;
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+// Robot interface of pick and place on the simulated cell; time passes while it blocks.
+class SimulatedRobot : public motion::Robot {
+ public:
+  explicit SimulatedRobot(SimulatedCell& cell) : cell_(cell) {}
+  JointVector joints() override;
+  motion::ExecutionResult execute(const motion::Trajectory& trajectory) override;
+  motion::GripResult grip(double gap_m, double force_n) override;
+
+ private:
+  SimulatedCell& cell_;
+};
+
+}  // namespace iwgnet_grasp::physics

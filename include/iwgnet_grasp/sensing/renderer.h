@@ -1,0 +1,55 @@
+// Ray-traced images of the cell (Embree): colour with light, shadow and materials; ideal depth.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <opencv2/core.hpp>
+#include <string>
+#include <vector>
+
+#include "iwgnet_grasp/core/cell_config.h"
+#include "iwgnet_grasp/core/mesh.h"
+
+namespace iwgnet_grasp::sensing {
+
+struct Material {
+  Eigen::Vector3f albedo{0.5f, 0.5f, 0.5f};
+  float metallic = 0.0f;   // 0 dielectric .. 1 metal
+  float roughness = 0.5f;  // 0 mirror .. 1 matt
+  float texture = 0.0f;    // strength of a procedural grain in object coordinates, 0 none
+};
+
+struct Light {
+  Eigen::Vector3f position{0.3f, -0.6f, 1.6f};  // m, base_link
+  Eigen::Vector3f intensity{1.0f, 1.0f, 1.0f};  // linear RGB
+  float ambient = 0.35f;                        // share of light that casts no shadow
+};
+
+class Renderer {
+ public:
+  Renderer();
+  ~Renderer();
+
+  // A mesh is built once; instances place it. Handles are stable until clear_instances().
+  int add_mesh(const TriangleMesh& mesh);
+  int add_box(const Eigen::Vector3d& size);  // centred at its origin
+  int add_instance(int mesh, const Material& material, const Pose& T_base_instance);
+  void set_pose(int instance, const Pose& T_base_instance);
+  void set_material(int instance, const Material& material);
+  void set_visible(int instance, bool visible);
+  void clear_instances();  // keeps the meshes
+
+  // CV_32FC1, m along the optical axis, NaN where no surface is hit. T_base_camera: optical -> base.
+  cv::Mat depth(const PinholeIntrinsics& camera, const Pose& T_base_camera);
+  // CV_32SC1: instance handle hit by each pixel, -1 for none.
+  cv::Mat instances(const PinholeIntrinsics& camera, const Pose& T_base_camera);
+  // CV_8UC3 RGB; noise_sigma: sensor noise in 8-bit steps, drawn from `seed`.
+  cv::Mat color(const PinholeIntrinsics& camera, const Pose& T_base_camera, const Light& light,
+                double noise_sigma, std::uint64_t seed);
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace iwgnet_grasp::sensing

@@ -1,0 +1,23 @@
+// Depth as an active stereo camera measures it (Eq. 4).
+#pragma once
+
+#include <cstdint>
+
+#include "iwgnet_grasp/sensing/renderer.h"
+
+namespace iwgnet_grasp::sensing {
+
+// Eq. 4: Z = f b / (x1 - x2). Disparity in px, f in px, b in m.
+double depth_from_disparity(double disparity_px, double fx_px, double baseline_m);
+
+// D455 depth image, CV_32FC1 m, NaN invalid: lateral shift and disparity noise, rounding to the
+// sensor's step, the shadow that the second imager cannot see, outliers, range limits. Pixels
+// draw from `seed`, whatever the number of threads.
+// ideal_left, ideal_right: noise-free depth of the left and the right imager.
+cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
+                     const CameraConfig& camera, std::uint64_t seed);
+
+// Renders both imagers and measures.
+cv::Mat capture_depth(Renderer& renderer, const CameraConfig& camera, std::uint64_t seed);
+
+}  // namespace iwgnet_grasp::sensing
