@@ -1,0 +1,201 @@
+"""The cycle that clears a table: observe, detect, estimate, prioritise, transform, execute, verify.
+
+It knows no transport. A `Cell` does the work: over the ROS graph (trials.ros) or in one process
+(trials.in_process). Ground truth never comes this way; that is the judge's alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import yaml
+
+
+@dataclass(frozen=True)
+class PlannedGrasp:
+    """A grasp in the image plane: (x, y, theta, w) of the paper, as GraspRectangle.msg."""
+
+    x_px: float
+    y_px: float
+    theta_rad: float  # closing direction, counter-clockwise as seen, (-pi/2, pi/2]
+    width_px: float
+    quality: float
+    depth_m: float
+
+
+@dataclass(frozen=True)
+class Target:
+    """One object of a sequence and the grasp that is to be tried on it."""
+
+    scene_id: int  # look that it was seen in
+    object_id: int  # index of the detection in that look
+    label: str
+    detection_score: float
+    priority: float  # S* of Eq. 21
+    grasp: PlannedGrasp
+    feasible: bool
+    reason: str = ""  # why not feasible
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the robot itself says about a pick (not the judge)."""
+
+    success: bool
+    reason: str = ""  # snake_case name of a PickPlace.action reason: missed, lost, no_plan, ...
+    message: str = ""
+
+
+class Cell(Protocol):
+    """What the supervisor asks of a transport. Calls block; errors that end a trial are raised
+    as CellError, errors of one grasp come back as an Outcome."""
+
+    def look(self) -> int:
+        """Takes one snapshot with the arm out of view; returns its scene id."""
+
+    def plan(self, scene_id: int, failed: Sequence[PlannedGrasp]) -> list[Target]:
+        """Detects, estimates, prioritises and transforms: the objects of a look in the order in
+        which they are to be grasped, each with its best feasible grasp that does not repeat one of
+        `failed` (see `repeats`). Objects without any such grasp come with feasible=False."""
+
+    def execute(self, target: Target, tray_slot: int) -> Outcome:
+        """Picks the object and puts it into the tray; the arm ends out of the camera's view."""
+
+    def time(self) -> float:
+        """Seconds on the cell's clock."""
+
+
+class CellError(RuntimeError):
+    """The cell cannot go on; one line that says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """config/supervisor.yaml."""
+
+    replan: str = "every"  # once | every
+    tray_slots: int = 10
+    max_attempts: int = 30
+    max_idle_looks: int = 3
+    repeat_distance_px: float = 12.0
+    repeat_angle_rad: float = 0.35
+    repeat_depth_m: float = 0.006
+
+    def __post_init__(self) -> None:
+        if self.replan not in ("once", "every"):
+            raise ValueError(f"replan: '{self.replan}' is not one of once, every")
+
+
+def load_settings(config_dir: str | Path, **changes: object) -> Settings:
+    """Settings of config_dir/supervisor.yaml with `changes` on top. Raises ValueError."""
+    path = Path(config_dir) / "supervisor.yaml"
+    try:
+        values = yaml.safe_load(path.read_text()) or {}
+    except (OSError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: cannot be read: {error}".replace("\n", " ")) from error
+    known = set(Settings.__dataclass_fields__)
+    for key in values:
+        if key not in known:
+            raise ValueError(f"{path}: key '{key}' is unknown (known: {', '.join(sorted(known))})")
+    return Settings(**{**values, **changes})
+
+
+def repeats(grasp: PlannedGrasp, failed: Sequence[PlannedGrasp], settings: Settings) -> bool:
+    """Whether a grasp is one of the failed ones again: same place, direction and height. A part
+    that has come to lie lower or higher since is another case and may be tried."""
+    for old in failed:
+        turn = abs(math.remainder(grasp.theta_rad - old.theta_rad, math.pi))
+        if (
+            math.hypot(grasp.x_px - old.x_px, grasp.y_px - old.y_px) <= settings.repeat_distance_px
+            and turn <= settings.repeat_angle_rad
+            and not abs(grasp.depth_m - old.depth_m) > settings.repeat_depth_m
+        ):
+            return True
+    return False
+
+
+@dataclass
+class Attempt:
+    """One executed pick."""
+
+    target: Target
+    outcome: Outcome
+    tray_slot: int
+    start_time_s: float  # on the cell's clock
+    end_time_s: float
+
+
+@dataclass
+class Cycle:
+    """What the supervisor did and why it ended: cleared, nothing_graspable, sequence_done,
+    attempts_used_up."""
+
+    attempts: list[Attempt] = field(default_factory=list)
+    failed: list[PlannedGrasp] = field(default_factory=list)
+    looks: int = 0
+    ended: str = ""
+
+
+def pick_line(number: int, attempt: Attempt) -> str:
+    """The line a person reads after each pick."""
+    target, outcome = attempt.target, attempt.outcome
+    grasp = target.grasp
+    verdict = "picked" if outcome.success else f"failed ({outcome.reason})"
+    note = f": {outcome.message}" if outcome.message and not outcome.success else ""
+    return (
+        f"pick {number:2d}  look {target.scene_id:2d} object {target.object_id:2d} {target.label}"
+        f"  S* {target.priority:.2f}  Q {grasp.quality:.2f}"
+        f"  at ({grasp.x_px:.0f}, {grasp.y_px:.0f}) px {math.degrees(grasp.theta_rad):+.0f} deg"
+        f"  {attempt.end_time_s - attempt.start_time_s:.1f} s  {verdict}{note}"
+    )
+
+
+def clear_table(
+    cell: Cell,
+    settings: Settings,
+    say: Callable[[str], None] = print,
+    cycle: Cycle | None = None,
+) -> Cycle:
+    """Runs the cycle until nothing is detected any more, nothing is graspable or the attempts are
+    used up. Fills `cycle` as it goes, so that a caller keeps what was done when an exception
+    (CellError, KeyboardInterrupt) ends it early."""
+    cycle = Cycle() if cycle is None else cycle
+    idle_looks = 0
+    slot = 0
+    while True:
+        scene_id = cell.look()
+        cycle.looks += 1
+        targets = cell.plan(scene_id, cycle.failed)
+        graspable = [target for target in targets if target.feasible]
+        if not graspable:
+            # Noise differs from look to look: an object may be seen, or be graspable, in the next.
+            idle_looks += 1
+            if not targets and (cycle.attempts or idle_looks >= settings.max_idle_looks):
+                cycle.ended = "cleared"
+                return cycle
+            if idle_looks >= settings.max_idle_looks:
+                for target in targets:
+                    say(f"object {target.object_id} {target.label} left: {target.reason}")
+                cycle.ended = "nothing_graspable"
+                return cycle
+            continue
+        idle_looks = 0
+        for target in graspable if settings.replan == "once" else graspable[:1]:
+            start = cell.time()
+            outcome = cell.execute(target, slot % settings.tray_slots)
+            cycle.attempts.append(Attempt(target, outcome, slot, start, cell.time()))
+            say(pick_line(len(cycle.attempts), cycle.attempts[-1]))
+            if outcome.success:
+                slot += 1
+            else:
+                cycle.failed.append(target.grasp)
+            if len(cycle.attempts) >= settings.max_attempts:
+                cycle.ended = "attempts_used_up"
+                return cycle
+        if settings.replan == "once":
+            cycle.ended = "sequence_done"
+            return cycle
