@@ -14,17 +14,7 @@ from typing import Protocol
 
 import yaml
 
-
-@dataclass(frozen=True)
-class PlannedGrasp:
-    """A grasp in the image plane: (x, y, theta, w) of the paper, as GraspRectangle.msg."""
-
-    x_px: float
-    y_px: float
-    theta_rad: float  # closing direction, counter-clockwise as seen, (-pi/2, pi/2]
-    width_px: float
-    quality: float
-    depth_m: float
+from iwgnet_grasp.perception.types import GraspRectangle
 
 
 @dataclass(frozen=True)
@@ -36,7 +26,7 @@ class Target:
     label: str
     detection_score: float
     priority: float  # S* of Eq. 21
-    grasp: PlannedGrasp
+    grasp: GraspRectangle
     feasible: bool
     reason: str = ""  # why not feasible
 
@@ -57,10 +47,11 @@ class Cell(Protocol):
     def look(self) -> int:
         """Takes one snapshot with the arm out of view; returns its scene id."""
 
-    def plan(self, scene_id: int, failed: Sequence[PlannedGrasp]) -> list[Target]:
+    def plan(self, scene_id: int, failed: Sequence[GraspRectangle]) -> list[Target]:
         """Detects, estimates, prioritises and transforms: the objects of a look in the order in
         which they are to be grasped, each with its best feasible grasp that does not repeat one of
-        `failed` (see `repeats`). Objects without any such grasp come with feasible=False."""
+        `failed` (priority.yaml says what repeating is). Objects without any such grasp come with
+        feasible=False."""
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:
         """Picks the object and puts it into the tray; the arm ends out of the camera's view."""
@@ -81,9 +72,6 @@ class Settings:
     tray_slots: int = 10
     max_attempts: int = 30
     max_idle_looks: int = 3
-    repeat_distance_px: float = 12.0
-    repeat_angle_rad: float = 0.35
-    repeat_depth_m: float = 0.006
 
     def __post_init__(self) -> None:
         if self.replan not in ("once", "every"):
@@ -104,20 +92,6 @@ def load_settings(config_dir: str | Path, **changes: object) -> Settings:
     return Settings(**{**values, **changes})
 
 
-def repeats(grasp: PlannedGrasp, failed: Sequence[PlannedGrasp], settings: Settings) -> bool:
-    """Whether a grasp is one of the failed ones again: same place, direction and height. A part
-    that has come to lie lower or higher since is another case and may be tried."""
-    for old in failed:
-        turn = abs(math.remainder(grasp.theta_rad - old.theta_rad, math.pi))
-        if (
-            math.hypot(grasp.x_px - old.x_px, grasp.y_px - old.y_px) <= settings.repeat_distance_px
-            and turn <= settings.repeat_angle_rad
-            and not abs(grasp.depth_m - old.depth_m) > settings.repeat_depth_m
-        ):
-            return True
-    return False
-
-
 @dataclass
 class Attempt:
     """One executed pick."""
@@ -135,7 +109,7 @@ class Cycle:
     attempts_used_up."""
 
     attempts: list[Attempt] = field(default_factory=list)
-    failed: list[PlannedGrasp] = field(default_factory=list)
+    failed: list[GraspRectangle] = field(default_factory=list)
     looks: int = 0
     ended: str = ""
 
