@@ -1,0 +1,116 @@
+"""Depth of one object in the empty scene (Step 2 of section 4.2, Fig. 8) and its pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iwgnet_grasp.perception.types import Box, GraspRectangle, PerceptionError, Window
+
+
+def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
+    """Depth image in float32 metres, NaN where invalid (0, negative or not finite).
+
+    Accepts float32/float64 metres and uint16 millimetres, (H, W). Raises PerceptionError.
+    """
+    depth = np.asarray(depth)
+    if depth.ndim != 2 or depth.size == 0:
+        raise PerceptionError(f"{name}: shape {depth.shape} is not an image (H, W)")
+    if depth.dtype == np.uint16:
+        depth = depth.astype(np.float32) * np.float32(1e-3)
+    elif depth.dtype in (np.float32, np.float64):
+        depth = depth.astype(np.float32)
+    else:
+        raise PerceptionError(
+            f"{name}: type {depth.dtype} is no depth; give 32FC1 metres or 16UC1 millimetres"
+        )
+    invalid = ~(np.isfinite(depth) & (depth > 0))
+    if invalid.all():
+        raise PerceptionError(f"{name}: no pixel holds a valid depth; check the depth camera")
+    depth[invalid] = np.nan
+    return depth
+
+
+def merge(depth: np.ndarray, empty_depth: np.ndarray, box: Box) -> np.ndarray:
+    """The empty scene's depth with the box's part of `depth` pasted in (Fig. 8b), (H, W) m.
+
+    A pixel of the box that was not measured stays NaN: the grasp network fills holes itself, in
+    the same way as it did in training. A pixel that only the empty scene lacks stays NaN too.
+    """
+    merged = empty_depth.copy()
+    merged[box.slices] = depth[box.slices]
+    return merged
+
+
+def crop_window(depth: np.ndarray, empty_depth: np.ndarray, box: Box, size: int) -> Window:
+    """The (size, size) window of the merged depth around the box's middle, at native resolution.
+
+    At the border of the image the window is moved inwards, so that it never leaves the image.
+    Raises PerceptionError when the image is smaller than the window.
+    """
+    height, width = depth.shape
+    if size > min(height, width):
+        raise PerceptionError(
+            f"depth: {width}x{height} px is smaller than the grasp network's window of {size} px"
+        )
+    u, v = box.center
+    x = min(max(round(u - (size - 1) / 2), 0), width - size)
+    y = min(max(round(v - (size - 1) / 2), 0), height - size)
+    window = slice(y, y + size), slice(x, x + size)
+    empty = empty_depth[window].copy()
+    inside = Box(
+        max(box.x - x, 0),
+        max(box.y - y, 0),
+        min(box.x + box.width - x, size) - max(box.x - x, 0),
+        min(box.y + box.height - y, size) - max(box.y - y, 0),
+    )
+    return Window(x, y, merge(depth[window], empty, inside), empty)
+
+
+def object_mask(
+    depth: np.ndarray, empty_depth: np.ndarray, box: Box, min_height: float
+) -> np.ndarray:
+    """Valid pixels of Eq. 18-19 in the box, (box.height, box.width) bool.
+
+    Valid are the pixels that were measured and lie more than `min_height` (m) before the empty
+    scene; the table seen in the box says nothing about the object. Where the empty scene has no
+    depth of its own, its median over the box stands in.
+    """
+    measured = depth[box.slices]
+    empty = empty_depth[box.slices]
+    known = np.isfinite(empty)
+    if not known.all():
+        if not known.any():
+            return np.zeros(measured.shape, bool)
+        empty = np.where(known, empty, np.median(empty[known]))
+    with np.errstate(invalid="ignore"):
+        return empty - measured > min_height
+
+
+def centroid(mask: np.ndarray, box: Box) -> tuple[float, float, int]:
+    """(u, v, N): Eq. 18-19 over the mask's pixels, in full-image px; NaN, NaN, 0 if none."""
+    rows, columns = np.nonzero(mask)
+    if rows.size == 0:
+        return float("nan"), float("nan"), 0
+    return box.x + float(columns.mean()), box.y + float(rows.mean()), int(rows.size)
+
+
+def grasp_depth(
+    depth: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangle, radius_px: float
+) -> float:
+    """Depth (m) of the surface that is to be gripped at a grasp, NaN if none was measured.
+
+    The median of the object's pixels (`mask`, of the box) within radius_px of the grasp point;
+    where the point lies over a bore or a hole in the depth, of those between the jaws.
+    """
+    rows, columns = np.nonzero(mask)
+    dx = columns + box.x - grasp.x_px
+    dy = rows + box.y - grasp.y_px
+    near = dx * dx + dy * dy <= radius_px * radius_px
+    if not near.any():
+        closing = np.cos(grasp.theta_rad), -np.sin(grasp.theta_rad)
+        along = np.abs(dx * closing[0] + dy * closing[1])
+        across = np.abs(-dx * closing[1] + dy * closing[0])
+        near = (along <= grasp.width_px / 2) & (across <= radius_px)
+    if not near.any():
+        return float("nan")
+    return float(np.median(depth[box.slices][rows[near], columns[near]]))

@@ -1,0 +1,260 @@
+"""Detect, merge, estimate, decode: what the perception node does with one look."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import yaml
+
+from iwgnet_grasp.perception.merged_depth import (
+    centroid,
+    crop_window,
+    grasp_depth,
+    metres,
+    object_mask,
+)
+from iwgnet_grasp.perception.types import (
+    Detection,
+    GraspRectangle,
+    Look,
+    ObjectGrasps,
+    PerceptionError,
+    Window,
+)
+
+PACKAGE = Path(__file__).resolve().parents[3]
+DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
+
+
+class ObjectDetector(Protocol):
+    """perception.detector.Detector."""
+
+    def detect(self, color: np.ndarray) -> list[Detection]: ...
+
+
+class WindowGrasps(Protocol):
+    """networks.inference.GraspEstimator: grasps of each window in the window's own px."""
+
+    input_px: int
+
+    def predict(self, depth: np.ndarray, empty: np.ndarray) -> list[list[Any]]: ...
+
+
+@dataclass(frozen=True)
+class PerceptionConfig:
+    """config/perception.yaml."""
+
+    detector_weights: Path
+    detector_backend: str
+    score_threshold: float
+    iou_threshold: float
+    max_objects: int
+    grasp_weights: Path
+    candidates: int
+    min_distance_px: float
+    min_angle_rad: float
+    min_height: float
+    grasp_depth_radius_px: float
+
+    @staticmethod
+    def load(path: str | Path = DEFAULT_CONFIG) -> PerceptionConfig:
+        """Raises PerceptionError for a file that is missing, malformed or lacks a key."""
+        path = Path(path)
+        try:
+            text = yaml.safe_load(path.read_text())
+            detector, grasps, pixels = text["detector"], text["grasps"], text["object_pixels"]
+            return PerceptionConfig(
+                detector_weights=_in_package(detector["weights"]),
+                detector_backend=str(detector["backend"]),
+                score_threshold=float(detector["score_threshold"]),
+                iou_threshold=float(detector["iou_threshold"]),
+                max_objects=int(detector["max_objects"]),
+                grasp_weights=_in_package(grasps["weights"]),
+                candidates=int(grasps["candidates"]),
+                min_distance_px=float(grasps["min_distance_px"]),
+                min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
+                min_height=float(pixels["min_height"]),
+                grasp_depth_radius_px=float(pixels["grasp_depth_radius_px"]),
+            )
+        except OSError as error:
+            raise PerceptionError(f"{path}: cannot be read ({error.strerror})") from error
+        except KeyError as error:
+            raise PerceptionError(f"{path}: key {error} is missing") from error
+        except (yaml.YAMLError, TypeError, ValueError) as error:
+            line = " ".join(str(error).split())
+            raise PerceptionError(f"{path}: not a valid perception config ({line})") from error
+
+
+class Perception:
+    """Object detector and grasp network on one look. Stateless between looks."""
+
+    def __init__(
+        self, config: PerceptionConfig, detector: ObjectDetector, estimator: WindowGrasps
+    ) -> None:
+        self.config = config
+        self.detector = detector
+        self.estimator = estimator
+
+    def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look:
+        """All objects of one look with their grasps, in descending order of detection score.
+
+        color: (H, W, 3) uint8 RGB. depth, empty_depth: (H, W) of the same view, float metres
+        (NaN or <= 0 invalid) or uint16 millimetres. Raises PerceptionError on anything else and
+        on a depth image without one valid pixel.
+        """
+        start = time.perf_counter()
+        color = checked_color(color)
+        depth = metres(depth, "depth")
+        empty_depth = metres(empty_depth, "empty_depth")
+        for name, image in (("depth", depth), ("empty_depth", empty_depth)):
+            if image.shape != color.shape[:2]:
+                raise PerceptionError(
+                    f"{name}: {image.shape[1]}x{image.shape[0]} px differs from the colour image's "
+                    f"{color.shape[1]}x{color.shape[0]} px; align it to the colour camera"
+                )
+        checked = time.perf_counter()
+        detections = self.detector.detect(color)
+        detected = time.perf_counter()
+        size = self.estimator.input_px
+        windows = tuple(crop_window(depth, empty_depth, d.box, size) for d in detections)
+        estimates: list[list[Any]] = []
+        if windows:
+            estimates = self.estimator.predict(
+                np.stack([w.depth for w in windows]), np.stack([w.empty for w in windows])
+            )
+        estimated = time.perf_counter()
+        objects = tuple(
+            self._object(i, detection, window, grasps, depth, empty_depth)
+            for i, (detection, window, grasps) in enumerate(
+                zip(detections, windows, estimates, strict=True)
+            )
+        )
+        end = time.perf_counter()
+        seconds = {
+            "check": checked - start,
+            "detect": detected - checked,
+            "grasp": estimated - detected,
+            "decode": end - estimated,
+            "total": end - start,
+        }
+        return Look(color, depth, empty_depth, objects, windows, seconds)
+
+    def _object(
+        self,
+        object_id: int,
+        detection: Detection,
+        window: Window,
+        estimates: Sequence[Any],
+        depth: np.ndarray,
+        empty_depth: np.ndarray,
+    ) -> ObjectGrasps:
+        config, box = self.config, detection.box
+        mask = object_mask(depth, empty_depth, box, config.min_height)
+        u, v, pixels = centroid(mask, box)
+        grasps = [
+            replace(
+                grasp,
+                depth_m=grasp_depth(depth, mask, box, grasp, config.grasp_depth_radius_px),
+            )
+            for grasp in select(
+                [in_image(estimate, window) for estimate in estimates],
+                detection,
+                config.candidates,
+                config.min_distance_px,
+                config.min_angle_rad,
+            )
+        ]
+        return ObjectGrasps(
+            object_id=object_id,
+            label=detection.label,
+            score=detection.score,
+            box=box,
+            centroid_u_px=u,
+            centroid_v_px=v,
+            centroid_depth_m=float(np.median(depth[box.slices][mask])) if pixels else math.nan,
+            valid_pixels=pixels,
+            grasps=tuple(grasps),
+        )
+
+
+def load_perception(path: str | Path = DEFAULT_CONFIG) -> Perception:
+    """Perception with the weights that a config file names. Raises PerceptionError."""
+    from iwgnet_grasp.networks.inference import GraspEstimator
+    from iwgnet_grasp.perception.detector import Detector
+
+    config = PerceptionConfig.load(path)
+    detector = Detector(
+        config.detector_weights,
+        score_threshold=config.score_threshold,
+        iou_threshold=config.iou_threshold,
+        max_objects=config.max_objects,
+        backend=config.detector_backend,
+    )
+    return Perception(config, detector, GraspEstimator(config.grasp_weights))
+
+
+def checked_color(color: np.ndarray) -> np.ndarray:
+    """The colour image, contiguous (H, W, 3) uint8. Raises PerceptionError."""
+    color = np.asarray(color)
+    if color.ndim != 3 or color.shape[2] != 3 or color.size == 0:
+        raise PerceptionError(f"color: shape {color.shape} is not an RGB image (H, W, 3)")
+    if color.dtype != np.uint8:
+        raise PerceptionError(f"color: type {color.dtype} is not rgb8 (uint8)")
+    return np.ascontiguousarray(color)
+
+
+def in_image(estimate: Any, window: Window) -> GraspRectangle:
+    """A grasp in window px -> full-image px. The window has the image's own resolution."""
+    return GraspRectangle(
+        x_px=float(estimate.x_px) + window.x,
+        y_px=float(estimate.y_px) + window.y,
+        theta_rad=half_turn(float(estimate.theta_rad)),
+        width_px=float(estimate.width_px),
+        quality=float(estimate.quality),
+    )
+
+
+def select(
+    grasps: Sequence[GraspRectangle],
+    detection: Detection,
+    count: int,
+    min_distance_px: float,
+    min_angle_rad: float,
+) -> list[GraspRectangle]:
+    """The best `count` distinct grasps whose centre lies in the box, by descending quality.
+
+    Two grasps are distinct when their centres are more than min_distance_px apart or their
+    closing directions more than min_angle_rad.
+    """
+    kept: list[GraspRectangle] = []
+    for grasp in sorted(grasps, key=lambda g: -g.quality):
+        if len(kept) == count:
+            break
+        if detection.box.contains(grasp.x_px, grasp.y_px) and not any(
+            same_grasp(grasp, other, min_distance_px, min_angle_rad) for other in kept
+        ):
+            kept.append(grasp)
+    return kept
+
+
+def same_grasp(a: GraspRectangle, b: GraspRectangle, distance_px: float, angle_rad: float) -> bool:
+    """True when centres are within distance_px and closing directions within angle_rad."""
+    apart = math.hypot(a.x_px - b.x_px, a.y_px - b.y_px)
+    turned = abs(half_turn(a.theta_rad - b.theta_rad))
+    return apart <= distance_px and turned <= angle_rad
+
+
+def half_turn(angle: float) -> float:
+    """The same closing direction in (-pi/2, pi/2]; a gripper is the same turned by pi."""
+    return math.pi / 2 - (math.pi / 2 - angle) % math.pi
+
+
+def _in_package(path: str) -> Path:
+    path = Path(path)
+    return path if path.is_absolute() else PACKAGE / path
