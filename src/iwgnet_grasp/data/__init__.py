@@ -1,0 +1,1 @@
+"""Grasp data: depth, rectangles, labels, and the sets on disk."""

@@ -1,0 +1,55 @@
+"""Maps -> grasps."""
+
+import cv2
+import numpy as np
+
+from iwgnet_grasp.data.grasp_rectangle import Grasp, wrap_theta
+from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
+
+Q_SIGMA = 2.0  # px, GG-CNN's
+MAP_SIGMA = 1.0  # px, of cos, sin and width
+
+
+def decode_grasps(
+    q: np.ndarray,
+    cos: np.ndarray,
+    sin: np.ndarray,
+    width: np.ndarray,
+    max_grasps: int = 20,
+    min_distance_px: int = 6,
+    threshold: float = 0.1,
+) -> list[Grasp]:
+    """Local maxima of the smoothed quality, best first. All maps float32 [H, W].
+
+    cos 2theta and sin 2theta are smoothed, never the angle, which jumps at +-90 deg. Grasps closer
+    than `min_distance_px` to a better one and below `threshold` are left out.
+    """
+    q = cv2.GaussianBlur(q, (0, 0), Q_SIGMA)
+    cos = cv2.GaussianBlur(cos, (0, 0), MAP_SIGMA)
+    sin = cv2.GaussianBlur(sin, (0, 0), MAP_SIGMA)
+    width = cv2.GaussianBlur(width, (0, 0), MAP_SIGMA)
+    grasps = []
+    for y, x in local_maxima(q, min_distance_px, threshold, max_grasps):
+        theta = float(wrap_theta(0.5 * np.arctan2(sin[y, x], cos[y, x])))
+        opening = max(float(width[y, x]), 0.0) * WIDTH_REFERENCE_PX
+        quality = float(np.clip(q[y, x], 0, 1))
+        grasps.append(Grasp(float(x), float(y), theta, opening, quality))
+    return grasps
+
+
+def local_maxima(
+    image: np.ndarray, min_distance: int, threshold: float, max_peaks: int
+) -> list[tuple[int, int]]:
+    """(row, column) of the peaks above the threshold, highest first, min_distance apart."""
+    size = 2 * min_distance + 1
+    highest = cv2.dilate(image, np.ones((size, size), np.uint8))
+    rows, columns = np.nonzero((image >= highest) & (image > threshold))
+    order = np.argsort(-image[rows, columns], kind="stable")
+    peaks: list[tuple[int, int]] = []
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if len(peaks) == max_peaks:
+            break
+        # Plateaus: equal neighbours are all maxima, one of them is enough.
+        if all(max(abs(row - r), abs(column - c)) > min_distance for r, c in peaks):
+            peaks.append((row, column))
+    return peaks
