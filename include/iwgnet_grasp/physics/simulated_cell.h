@@ -19,14 +19,16 @@ namespace iwgnet_grasp::physics {
 class SimulatedCell {
  public:
   // package_dir: the checkout (urdf/, config/, assets/). config_dir empty: package_dir/config.
+  // Throws Error.
   explicit SimulatedCell(const std::string& package_dir, const std::string& config_dir = "");
   ~SimulatedCell();
 
   const CellConfig& config() const;
 
-  // Arm to the observing pose, time to 0, judge reset. An empty name leaves the table bare.
-  // Returns the number of parts. Throws Error for an unknown scene.
+  // Arm to the observing pose, time to 0 (parts settle from there on), judge reset. An empty name
+  // leaves the table bare. Returns the number of parts. Throws Error for an unknown scene.
   int load_scene(const std::string& scene, std::uint64_t seed);
+  int load_scene(const SceneSpec& spec, std::uint64_t seed);
   void step(int steps = 1);  // controllers, physics, judge
   double time() const;
   double timestep() const;
@@ -45,15 +47,23 @@ class SimulatedCell {
   cv::Mat color();          // CV_8UC3 RGB
   cv::Mat depth();          // CV_32FC1 m, depth frame, NaN invalid
   cv::Mat aligned_depth(const cv::Mat& depth) const;  // in the colour frame
+  // The camera that the images are taken with; config().camera until set. The scene's own
+  // geometry (body, mount) stays.
+  const CameraConfig& camera() const;
+  void set_camera(const CameraConfig& camera);
 
   // Ground truth: for the judge, for labels and for pictures only.
   World& world();
   sensing::Renderer& renderer();          // poses brought up to date by sync_renderer()
   void sync_renderer();
   int part_instance(int part) const;      // renderer handle of a part
-  const std::vector<PartModel>& models() const;
+  const std::vector<PartModel>& models() const;  // of the scene's parts, by index
+  cv::Mat ideal_depth();                  // CV_32FC1 m, colour frame, no noise
+  cv::Mat part_mask();                    // CV_32SC1, colour frame: index of the part seen, or -1
+  void show_parts(bool shown);            // to the camera; the physics keeps them
   void set_light(const sensing::Light& light);
   void set_part_material(int part, const sensing::Material& material);
+  void set_table_material(const sensing::Material& material);
   Verdict verdict() const;
 
  private:
