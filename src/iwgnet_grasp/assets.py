@@ -142,6 +142,29 @@ def make_robot(assets: Path) -> bool:
     return True
 
 
+def make_parts(assets: Path, config: Path = ROOT / "config" / "parts.yaml") -> int:
+    """Makes assets/parts, keeping parts that a user added. Returns how many parts it made, 0 when
+    the library was up to date. Raises AssetError."""
+    place = assets / "parts"
+    sources = sorted((Path(__file__).parent / "parts").glob("*.py"))
+    wanted = digest(config if config.is_file() else "", *sources)
+    if is_current(place, wanted):
+        return 0
+    from iwgnet_grasp.parts import library
+
+    assets.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=assets, prefix=".parts-") as temporary:
+        made = Path(temporary) / "parts"
+        try:
+            count = library.make_library(config, made)
+        except library.PartError as error:
+            raise AssetError(str(error)) from None
+        library.keep_user_parts(place, made)
+        (made / ".digest").write_text(wanted + "\n")
+        replace_folder(made, place)
+    return count
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m iwgnet_grasp.assets", description="Make the meshes below assets/."
@@ -151,6 +174,8 @@ def main() -> int:
     try:
         if make_robot(arguments.assets):
             print(f"robot meshes: {arguments.assets / 'robot'}")
+        if count := make_parts(arguments.assets):
+            print(f"{count} parts: {arguments.assets / 'parts'}")
     except (AssetError, OSError) as error:
         print(f"assets: {error}", file=sys.stderr)
         return 1
