@@ -13,7 +13,7 @@ Eigen::Vector3d deproject(const PinholeIntrinsics& k, double u, double v, double
 Eigen::Vector2d project(const PinholeIntrinsics& k, const Eigen::Vector3d& p);
 
 // Depth image (CV_32FC1 m, NaN invalid) of `from` as seen by `to`: nearest surface wins,
-// NaN where nothing falls.
+// NaN where nothing falls. Throws Error when image and camera differ in size.
 cv::Mat align_depth(const cv::Mat& depth, const PinholeIntrinsics& from,
                     const PinholeIntrinsics& to, const Pose& T_to_from);
 

@@ -23,6 +23,7 @@ struct Light {
   Eigen::Vector3f position{0.3f, -0.6f, 1.6f};  // m, base_link
   Eigen::Vector3f intensity{1.0f, 1.0f, 1.0f};  // linear RGB
   float ambient = 0.35f;                        // share of light that casts no shadow
+  float radius = 0.10f;                         // m, of the lamp; 0 gives hard shadows
 };
 
 class Renderer {

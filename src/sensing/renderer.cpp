@@ -1,0 +1,423 @@
+#include "iwgnet_grasp/sensing/renderer.h"
+
+#include <embree3/rtcore.h>
+
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <map>
+
+#include "parallel.h"
+#include "shading.h"
+
+namespace iwgnet_grasp::sensing {
+namespace {
+
+constexpr int kTile = 4;  // pixels; 4 x 4 coherent rays make a packet
+constexpr int kLanes = kTile * kTile;
+constexpr float kFar = std::numeric_limits<float>::infinity();
+constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+constexpr float kOcclusionRange = 0.08f;  // m, of ambient occlusion: the size of the parts
+constexpr float kSurfaceOffset = 2e-5f;   // m, keeps secondary rays off their own surface
+constexpr float kCrease = 0.77f;          // cos 40 deg: sharper edges are not shaded smooth
+constexpr float kFilterDepth = 0.004f;    // m, shadows are not smoothed across larger steps
+
+struct Mesh {
+  RTCScene scene = nullptr;
+  std::vector<std::array<Vec3, 3>> normals;  // of each triangle's corners, mesh frame
+};
+
+struct Instance {
+  int mesh;
+  RTCGeometry geometry;
+  Material material;
+  Rotation R;  // instance -> base
+  Vec3 t;
+};
+
+// Smooth shading: a corner's normal is the mean of the faces around it, weighted by their area,
+// that do not lie beyond a crease.
+std::vector<std::array<Vec3, 3>> corner_normals(const TriangleMesh& mesh) {
+  const std::size_t n = mesh.triangles.size();
+  std::vector<Eigen::Vector3f> area(n), unit(n);
+  std::vector<std::vector<std::uint32_t>> around(mesh.vertices.size());
+  for (std::size_t i = 0; i < n; ++i) {
+    const auto& [a, b, c] = mesh.triangles[i];
+    area[i] = (mesh.vertices[b] - mesh.vertices[a]).cross(mesh.vertices[c] - mesh.vertices[a]);
+    unit[i] = area[i].stableNormalized();
+    for (const auto corner : mesh.triangles[i]) around[corner].push_back(i);
+  }
+  std::vector<std::array<Vec3, 3>> normals(n);
+  for (std::size_t i = 0; i < n; ++i)
+    for (int k = 0; k < 3; ++k) {
+      Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+      for (const auto face : around[mesh.triangles[i][k]])
+        if (unit[face].dot(unit[i]) > kCrease) sum += area[face];
+      const Eigen::Vector3f normal = sum.stableNormalized();
+      normals[i][k] = {normal.x(), normal.y(), normal.z()};
+    }
+  return normals;
+}
+
+TriangleMesh box_mesh(const Eigen::Vector3d& size) {
+  TriangleMesh mesh;
+  for (int i = 0; i < 8; ++i)
+    mesh.vertices.emplace_back(size.x() * ((i & 1) - 0.5), size.y() * ((i >> 1 & 1) - 0.5),
+                               size.z() * ((i >> 2 & 1) - 0.5));
+  mesh.triangles = {{0, 2, 1}, {1, 2, 3}, {4, 5, 6}, {5, 7, 6}, {0, 1, 4}, {1, 5, 4},
+                    {2, 6, 3}, {3, 6, 7}, {0, 4, 2}, {2, 4, 6}, {1, 3, 5}, {3, 7, 5}};
+  return mesh;
+}
+
+// Rays of a camera in the base frame, unnormalised: at parameter t the depth is t.
+struct RayFrame {
+  Vec3 origin, corner, right, down;  // corner: direction of pixel (0, 0)
+
+  RayFrame(const PinholeIntrinsics& k, const Pose& T) {
+    const auto vec = [](const Eigen::Vector3d& v) {
+      return Vec3{static_cast<float>(v.x()), static_cast<float>(v.y()), static_cast<float>(v.z())};
+    };
+    const Eigen::Matrix3d R = T.rotation();
+    origin = vec(T.translation());
+    corner = vec(R * Eigen::Vector3d(-k.cx / k.fx, -k.cy / k.fy, 1.0));
+    right = vec(R.col(0) / k.fx);
+    down = vec(R.col(1) / k.fy);
+  }
+  Vec3 direction(int u, int v) const {
+    return corner + right * static_cast<float>(u) + down * static_cast<float>(v);
+  }
+};
+
+void require_camera(const PinholeIntrinsics& k) {
+  if (k.width <= 0 || k.height <= 0 || k.fx <= 0 || k.fy <= 0)
+    throw Error("renderer: the camera needs a positive size and focal length");
+}
+
+struct Packet {
+  alignas(64) int valid[kLanes];
+  RTCRayHit16 hit;
+
+  // The rays of the tile whose top left pixel is (u, v).
+  void aim(const RayFrame& frame, const PinholeIntrinsics& camera, int u, int v) {
+    for (int i = 0; i < kLanes; ++i) {
+      const int x = u + i % kTile, y = v + i / kTile;
+      valid[i] = x < camera.width && y < camera.height ? -1 : 0;
+      const Vec3 d = frame.direction(x, y);
+      hit.ray.org_x[i] = frame.origin.x;
+      hit.ray.org_y[i] = frame.origin.y;
+      hit.ray.org_z[i] = frame.origin.z;
+      hit.ray.dir_x[i] = d.x;
+      hit.ray.dir_y[i] = d.y;
+      hit.ray.dir_z[i] = d.z;
+      hit.ray.tnear[i] = 0.0f;
+      hit.ray.tfar[i] = kFar;
+      hit.ray.time[i] = 0.0f;
+      hit.ray.mask[i] = -1u;
+      hit.ray.flags[i] = 0;
+      hit.hit.geomID[i] = RTC_INVALID_GEOMETRY_ID;
+      hit.hit.instID[0][i] = RTC_INVALID_GEOMETRY_ID;
+    }
+  }
+};
+
+// Rays from the surface points of a packet towards the lamp or into the open.
+struct ShadowPacket {
+  alignas(64) int valid[kLanes];
+  RTCRay16 ray;
+
+  void set(int lane, const Vec3& origin, const Vec3& direction, float range) {
+    ray.org_x[lane] = origin.x;
+    ray.org_y[lane] = origin.y;
+    ray.org_z[lane] = origin.z;
+    ray.dir_x[lane] = direction.x;
+    ray.dir_y[lane] = direction.y;
+    ray.dir_z[lane] = direction.z;
+    ray.tnear[lane] = 0.0f;
+    ray.tfar[lane] = range;
+    ray.time[lane] = 0.0f;
+    ray.mask[lane] = -1u;
+    ray.flags[lane] = 0;
+  }
+  bool free(int lane) const { return ray.tfar[lane] >= 0.0f; }  // Embree sets -inf when occluded
+};
+
+}  // namespace
+
+struct Renderer::Impl {
+  RTCDevice device = nullptr;
+  RTCScene scene = nullptr;
+  std::vector<Mesh> meshes;
+  std::vector<Instance> instances;
+  bool dirty = true;
+
+  Impl() : device(rtcNewDevice(nullptr)) {
+    if (!device) throw Error("renderer: Embree cannot start on this machine");
+    new_scene();
+  }
+  ~Impl() {
+    drop_instances();
+    rtcReleaseScene(scene);
+    for (const Mesh& mesh : meshes) rtcReleaseScene(mesh.scene);
+    rtcReleaseDevice(device);
+  }
+
+  void new_scene() {
+    scene = rtcNewScene(device);
+    rtcSetSceneFlags(scene, RTC_SCENE_FLAG_DYNAMIC);
+    rtcSetSceneBuildQuality(scene, RTC_BUILD_QUALITY_LOW);
+    dirty = true;
+  }
+  void drop_instances() {
+    for (const Instance& instance : instances) rtcReleaseGeometry(instance.geometry);
+    instances.clear();
+  }
+
+  Instance& instance(int handle) {
+    if (handle < 0 || handle >= static_cast<int>(instances.size()))
+      throw Error("renderer: there is no instance " + std::to_string(handle));
+    return instances[handle];
+  }
+
+  void place(Instance& instance, const Pose& T) {
+    const Eigen::Matrix3f R = T.rotation().cast<float>();
+    const Eigen::Vector3f t = T.translation().cast<float>();
+    const float columns[12] = {R(0, 0), R(1, 0), R(2, 0), R(0, 1), R(1, 1), R(2, 1),
+                               R(0, 2), R(1, 2), R(2, 2), t.x(),   t.y(),   t.z()};
+    for (int i = 0; i < 3; ++i) instance.R.column[i] = {R(0, i), R(1, i), R(2, i)};
+    instance.t = {t.x(), t.y(), t.z()};
+    rtcSetGeometryTransform(instance.geometry, 0, RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR, columns);
+    rtcCommitGeometry(instance.geometry);
+    dirty = true;
+  }
+
+  void commit() {
+    if (dirty) rtcCommitScene(scene);
+    dirty = false;
+  }
+
+  // Calls write(u, v, lane, packet) for every pixel after its packet was traced.
+  template <typename Write>
+  void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write) {
+    require_camera(camera);
+    commit();
+    const RayFrame frame(camera, T_base_camera);
+    parallel_rows(camera.height, kTile, [&](int first, int) {
+      RTCIntersectContext context;
+      rtcInitIntersectContext(&context);
+      context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+      Packet packet;
+      for (int u = 0; u < camera.width; u += kTile) {
+        packet.aim(frame, camera, u, first);
+        rtcIntersect16(packet.valid, scene, &context, &packet.hit);
+        for (int i = 0; i < kLanes; ++i)
+          if (packet.valid[i]) write(u + i % kTile, first + i / kTile, i, packet);
+      }
+    });
+  }
+
+  Surface surface(const Packet& packet, int lane) const {
+    const auto& ray = packet.hit.ray;
+    const auto& hit = packet.hit.hit;
+    const Instance& instance = instances[hit.instID[0][lane]];
+    const auto& corner = meshes[instance.mesh].normals[hit.primID[lane]];
+    Surface surface;
+    const Vec3 direction{ray.dir_x[lane], ray.dir_y[lane], ray.dir_z[lane]};
+    const Vec3 origin{ray.org_x[lane], ray.org_y[lane], ray.org_z[lane]};
+    surface.position = origin + direction * ray.tfar[lane];
+    surface.to_eye = normalized(direction * -1.0f);
+    surface.object_position = transposed_times(instance.R, surface.position - instance.t);
+    const float u = hit.u[lane], v = hit.v[lane];
+    surface.object_normal =
+        normalized(corner[0] * (1.0f - u - v) + corner[1] * u + corner[2] * v);
+    surface.face_normal =
+        normalized(instance.R * Vec3{hit.Ng_x[lane], hit.Ng_y[lane], hit.Ng_z[lane]});
+    if (dot(surface.face_normal, surface.to_eye) < 0.0f) {  // an open mesh seen from behind
+      surface.face_normal = surface.face_normal * -1.0f;
+      surface.object_normal = surface.object_normal * -1.0f;
+    }
+    surface.normal = instance.R * surface.object_normal;
+    return surface;
+  }
+};
+
+Renderer::Renderer() : impl_(std::make_unique<Impl>()) {}
+Renderer::~Renderer() = default;
+
+int Renderer::add_mesh(const TriangleMesh& mesh) {
+  if (mesh.triangles.empty()) throw Error("renderer: a mesh needs at least one triangle");
+  for (const auto& triangle : mesh.triangles)
+    for (const auto corner : triangle)
+      if (corner >= mesh.vertices.size())
+        throw Error("renderer: a triangle names vertex " + std::to_string(corner) + " of " +
+                    std::to_string(mesh.vertices.size()));
+  const RTCGeometry geometry = rtcNewGeometry(impl_->device, RTC_GEOMETRY_TYPE_TRIANGLE);
+  void* vertices = rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
+                                           3 * sizeof(float), mesh.vertices.size());
+  std::memcpy(vertices, mesh.vertices.data(), mesh.vertices.size() * 3 * sizeof(float));
+  void* triangles = rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
+                                            3 * sizeof(std::uint32_t), mesh.triangles.size());
+  std::memcpy(triangles, mesh.triangles.data(), mesh.triangles.size() * 3 * sizeof(std::uint32_t));
+  rtcCommitGeometry(geometry);
+  Mesh built;
+  built.scene = rtcNewScene(impl_->device);
+  rtcAttachGeometry(built.scene, geometry);
+  rtcReleaseGeometry(geometry);
+  rtcCommitScene(built.scene);
+  built.normals = corner_normals(mesh);
+  impl_->meshes.push_back(std::move(built));
+  return static_cast<int>(impl_->meshes.size()) - 1;
+}
+
+int Renderer::add_box(const Eigen::Vector3d& size) { return add_mesh(box_mesh(size)); }
+
+int Renderer::add_instance(int mesh, const Material& material, const Pose& T_base_instance) {
+  if (mesh < 0 || mesh >= static_cast<int>(impl_->meshes.size()))
+    throw Error("renderer: there is no mesh " + std::to_string(mesh));
+  const int handle = static_cast<int>(impl_->instances.size());
+  Instance instance;
+  instance.mesh = mesh;
+  instance.material = material;
+  instance.geometry = rtcNewGeometry(impl_->device, RTC_GEOMETRY_TYPE_INSTANCE);
+  rtcSetGeometryInstancedScene(instance.geometry, impl_->meshes[mesh].scene);
+  rtcSetGeometryTimeStepCount(instance.geometry, 1);
+  impl_->place(instance, T_base_instance);
+  rtcAttachGeometryByID(impl_->scene, instance.geometry, handle);
+  impl_->instances.push_back(instance);
+  return handle;
+}
+
+void Renderer::set_pose(int instance, const Pose& T_base_instance) {
+  impl_->place(impl_->instance(instance), T_base_instance);
+}
+
+void Renderer::set_material(int instance, const Material& material) {
+  impl_->instance(instance).material = material;
+}
+
+void Renderer::set_visible(int instance, bool visible) {
+  const RTCGeometry geometry = impl_->instance(instance).geometry;
+  visible ? rtcEnableGeometry(geometry) : rtcDisableGeometry(geometry);
+  impl_->dirty = true;
+}
+
+void Renderer::clear_instances() {
+  impl_->drop_instances();
+  rtcReleaseScene(impl_->scene);
+  impl_->new_scene();
+}
+
+cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
+  cv::Mat depth(camera.height, camera.width, CV_32FC1);
+  impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
+    const float t = packet.hit.ray.tfar[lane];
+    depth.ptr<float>(v)[u] = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID ? kNaN : t;
+  });
+  return depth;
+}
+
+cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
+  cv::Mat ids(camera.height, camera.width, CV_32SC1);
+  impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
+    ids.ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);  // invalid is -1
+  });
+  return ids;
+}
+
+cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                        const Light& light, double noise_sigma, std::uint64_t seed) {
+  const Lighting lighting(light, T_base_camera);
+  // Each pixel of a 4 x 4 block looks at another part of the lamp and of the sky; the mean over
+  // the block's 16 neighbours then is a soft shadow at the price of one ray (interleaved sampling).
+  enum : std::uint8_t { kLit = 1, kOpen = 2 };
+  const int width = camera.width, height = camera.height;
+  cv::Mat visibility(height, width, CV_8UC1, cv::Scalar(kLit | kOpen));
+  cv::Mat direct(height, width, CV_32FC3), ambient(height, width, CV_32FC3);
+  cv::Mat depth(height, width, CV_32FC1), ids(height, width, CV_32SC1);
+
+  require_camera(camera);
+  impl_->commit();
+  const RayFrame frame(camera, T_base_camera);
+  parallel_rows(height, kTile, [&](int first, int) {
+    RTCIntersectContext context, shadow_context;
+    rtcInitIntersectContext(&context);
+    rtcInitIntersectContext(&shadow_context);
+    context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+    Packet packet;
+    ShadowPacket lamp, sky;
+    for (int u = 0; u < width; u += kTile) {
+      packet.aim(frame, camera, u, first);
+      rtcIntersect16(packet.valid, impl_->scene, &context, &packet.hit);
+      for (int i = 0; i < kLanes; ++i) {
+        lamp.valid[i] = sky.valid[i] = 0;
+        if (!packet.valid[i]) continue;
+        const int x = u + i % kTile, y = first + i / kTile;
+        auto& direct_px = direct.ptr<Vec3>(y)[x];
+        auto& ambient_px = ambient.ptr<Vec3>(y)[x];
+        ids.ptr<int>(y)[x] = static_cast<int>(packet.hit.hit.instID[0][i]);
+        depth.ptr<float>(y)[x] = packet.hit.ray.tfar[i];
+        if (packet.hit.hit.geomID[i] == RTC_INVALID_GEOMETRY_ID) {
+          direct_px = {0, 0, 0};
+          ambient_px = lighting.background(static_cast<float>(y) / height);
+          continue;
+        }
+        Surface surface = impl_->surface(packet, i);
+        const Instance& instance = impl_->instances[packet.hit.hit.instID[0][i]];
+        const Vec3 origin = surface.position + surface.face_normal * kSurfaceOffset;
+        const Vec3 to_lamp = lighting.sample_lamp(i) - origin;
+        lighting.shade(surface, instance.material, instance.R, &direct_px, &ambient_px);
+        if (dot(to_lamp, surface.face_normal) > 0.0f) {
+          lamp.valid[i] = -1;
+          lamp.set(i, origin, to_lamp, 1.0f);
+        } else {
+          visibility.ptr<std::uint8_t>(y)[x] &= ~kLit;
+        }
+        sky.valid[i] = -1;
+        sky.set(i, origin, hemisphere(surface.face_normal, i), kOcclusionRange);
+      }
+      rtcOccluded16(lamp.valid, impl_->scene, &shadow_context, &lamp.ray);
+      rtcOccluded16(sky.valid, impl_->scene, &shadow_context, &sky.ray);
+      for (int i = 0; i < kLanes; ++i) {
+        if (!sky.valid[i]) continue;
+        std::uint8_t& seen = visibility.ptr<std::uint8_t>(first + i / kTile)[u + i % kTile];
+        if (lamp.valid[i] && !lamp.free(i)) seen &= ~kLit;
+        if (!sky.free(i)) seen &= ~kOpen;
+      }
+    }
+  });
+
+  cv::Mat linear(height, width, CV_32FC3);
+  parallel_rows(height, 16, [&](int first, int last) {
+    for (int y = first; y < last; ++y) {
+      const int y0 = std::clamp(y - 1, 0, std::max(0, height - kTile));
+      const int y1 = std::min(y0 + kTile, height);
+      for (int x = 0; x < width; ++x) {
+        const int x0 = std::clamp(x - 1, 0, std::max(0, width - kTile));
+        const int x1 = std::min(x0 + kTile, width);
+        const int id = ids.ptr<int>(y)[x];
+        const float z = depth.ptr<float>(y)[x];
+        int lit = 0, open = 0, count = 0;
+        for (int yy = y0; yy < y1; ++yy) {
+          const auto* seen = visibility.ptr<std::uint8_t>(yy);
+          const int* other = ids.ptr<int>(yy);
+          const float* other_z = depth.ptr<float>(yy);
+          for (int xx = x0; xx < x1; ++xx) {
+            const int same = (other[xx] == id) & (std::abs(other_z[xx] - z) < kFilterDepth);
+            count += same;
+            lit += same & (seen[xx] & kLit);
+            open += same & (seen[xx] >> 1);
+          }
+        }
+        const float weight = count > 0 ? 1.0f / count : 0.0f;
+        linear.ptr<Vec3>(y)[x] = direct.ptr<Vec3>(y)[x] * (lit * weight) +
+                                 ambient.ptr<Vec3>(y)[x] * (count > 0 ? open * weight : 1.0f);
+      }
+    }
+  });
+
+  cv::Mat image(height, width, CV_8UC3);
+  develop(linear, noise_sigma, seed, image);
+  return image;
+}
+
+}  // namespace iwgnet_grasp::sensing
