@@ -1,5 +1,12 @@
 // UR5: Denavit-Hartenberg model (Eq. 1) and closed-form inverse kinematics (Eq. 2).
 // Poses are T_base_tool0: tool0 -> base_link as in the URDF, which is the DH base turned by pi about z.
+//
+// The sign of Eq. 2. Let (X, Y) = (px - d6 ax, py - d6 ay) be the wrist centre in the DH base frame.
+// Forward kinematics demands X sin q1 - Y cos q1 = d4, so
+//   q1 = atan2(Y, X) + atan2(d4, +-sqrt(X^2 + Y^2 - d4^2)).
+// Eq. 2 as printed starts with atan2(d6 ay - py, px - d6 ax) = atan2(-Y, X) and gives exactly -q1,
+// for both roots. With its second argument negated, atan2(d6 ay - py, d6 ax - px) - atan2(d4, ...),
+// it gives q1. test_kinematics_ur5 shows both; inverse() uses the first form.
 #pragma once
 
 #include <array>
