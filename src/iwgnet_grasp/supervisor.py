@@ -26,7 +26,7 @@ class Target:
     label: str
     detection_score: float
     priority: float  # S* of Eq. 21
-    grasp: GraspRectangle
+    grasp: GraspRectangle | None  # None: no candidate is left, never executed
     feasible: bool
     reason: str = ""  # why not feasible
 

@@ -38,8 +38,10 @@ class Trial:
         if self.verdict is not None:
             return bool(self.verdict["success"])
         picks = self.cycle.attempts
-        return self.cycle.ended in ("cleared", "sequence_done") and bool(picks) and all(
-            pick.outcome.success for pick in picks
+        return (
+            self.cycle.ended in ("cleared", "sequence_done")
+            and bool(picks)
+            and all(pick.outcome.success for pick in picks)
         )
 
     def to_json(self) -> dict:
@@ -103,6 +105,18 @@ def pick_entry(attempt: Attempt, verdict: Verdict | None) -> dict:
         entry["slip_deg"] = round(max(pick["slip_deg"] for pick in judged), 3)
         entry["part"] = worst["part"] if worst["part"] >= 0 else None
     return entry
+
+
+def judged_by(verdict_json: Callable[[], str]) -> Callable[[], Verdict]:
+    """The judge's JSON as a dict. CellError when it is not one."""
+
+    def judge() -> Verdict:
+        try:
+            return json.loads(verdict_json())
+        except json.JSONDecodeError as error:
+            raise CellError(f"the judge's verdict is not JSON: {error}") from None
+
+    return judge
 
 
 def write_json(path: Path, value: object) -> None:
