@@ -90,7 +90,15 @@ def replace_folder(made: Path, place: Path) -> None:
 
 
 def _download(requirement: str, folder: Path) -> Path:
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--only-binary=:all:",
+    ]
     command += ["--disable-pip-version-check", "--dest", str(folder), requirement]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     wheels = list(folder.glob(requirement.split("==")[0].replace("-", "_") + "-*.whl"))
@@ -134,7 +142,9 @@ def make_robot(assets: Path) -> bool:
                     try:
                         data = archive.read(source)
                     except KeyError:
-                        raise AssetError(f"{wheel.name} has no {source}; is the pin in assets.py right?") from None
+                        raise AssetError(
+                            f"{wheel.name} has no {source}; is the pin in assets.py right?"
+                        ) from None
                     _place(data, source, made / target, to_metres)
             wheel.unlink()
         (made / ".digest").write_text(wanted + "\n")
@@ -146,7 +156,7 @@ def make_parts(assets: Path, config: Path = ROOT / "config" / "parts.yaml") -> i
     """Makes assets/parts, keeping parts that a user added. Returns how many parts it made, 0 when
     the library was up to date. Raises AssetError."""
     place = assets / "parts"
-    sources = sorted((Path(__file__).parent / "parts").glob("*.py"))
+    sources = sorted((Path(__file__).parent / "parts").glob("[!_]*.py"))
     wanted = digest(config if config.is_file() else "", *sources)
     if is_current(place, wanted):
         return 0

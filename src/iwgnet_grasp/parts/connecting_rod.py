@@ -58,15 +58,15 @@ class ConnectingRod:
         reach, length = self.lug
         bore, end = self.big_bore / 2, self.big_diameter / 2 + reach
         x = length / 2
-        return [polygon([(-x, s * bore), (x, s * bore), (x, s * end), (-x, s * end)]) for s in (1, -1)]
+        return [
+            polygon([(-x, s * bore), (x, s * bore), (x, s * end), (-x, s * end)]) for s in (1, -1)
+        ]
 
     def _bolt_heads(self) -> list[Manifold]:
         reach, length = self.lug
         y = self.big_diameter / 2 + reach - BOLT_HEAD / 2 - 0.0005
         head = along_x(disc(BOLT_HEAD, segments=6).extrude(BOLT_HEAD_HEIGHT + 0.001))
-        return [
-            head.translate((-length / 2 - BOLT_HEAD_HEIGHT, s * y, 0.0)) for s in (1, -1)
-        ]
+        return [head.translate((-length / 2 - BOLT_HEAD_HEIGHT, s * y, 0.0)) for s in (1, -1)]
 
     def solid(self) -> Manifold:
         small_centre = (self.centre_distance, 0.0)
@@ -122,10 +122,12 @@ class ConnectingRod:
         pieces.append(plate(self._shank(x0, x1), self.web))
         for s in (1, -1):
             a, b = s * self._width(begin) / 2, s * self._width(end) / 2
-            rib = polygon([(begin, a), (end, b), (begin, a - s * self.rib), (end, b - s * self.rib)])
+            rib = polygon(
+                [(begin, a), (end, b), (begin, a - s * self.rib), (end, b - s * self.rib)]
+            )
             pieces.append(plate(rib, self.shank_thickness))
         # Roots with the fillets that widen them.
-        flare = 0.0035
+        flare = 0.0015
         a = self._width(begin) / 2
         pieces.append(
             plate(
@@ -137,8 +139,6 @@ class ConnectingRod:
         reach = np.sqrt((self.small_diameter / 2) ** 2 - (self.centre_distance - end) ** 2)
         b_end = min(b + 0.002, reach)
         pieces.append(
-            plate(
-                polygon([(end, b_end), (end, -b_end), (x1, b), (x1, -b)]), self.shank_thickness
-            )
+            plate(polygon([(end, b_end), (end, -b_end), (x1, b), (x1, -b)]), self.shank_thickness)
         )
         return pieces

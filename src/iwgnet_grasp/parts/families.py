@@ -44,7 +44,10 @@ class Bracket:
         return [
             plate(polygon([(0, 0), (a, 0), (a, t), (0, t)]), self.width),
             plate(polygon([(0, 0), (t, 0), (t, b), (0, b)]), self.width),
-            plate(polygon([(t / 2, t / 2), (reach, t / 2), (reach, t), (t, reach), (t / 2, reach)]), self.gusset),
+            plate(
+                polygon([(t / 2, t / 2), (reach, t / 2), (reach, t), (t, reach), (t / 2, reach)]),
+                self.gusset,
+            ),
         ]
 
     def solid(self) -> Manifold:

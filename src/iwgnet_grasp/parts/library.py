@@ -28,12 +28,19 @@ KINDS = {
     "tees": Tee,
     "prisms": Prism,
 }
-LONGEST = 0.25  # m: larger parts do not fit the workspace and the tray's slots
+LONGEST = 0.17  # m: a slot of the tray (config/cell.yaml) is 0.18 m long
+THINNEST = 0.002  # m: thinner parts drown in the depth camera's noise
 HEAVIEST = 4.0  # kg: the UR5 carries 5 kg, the gripper weighs 0.92
+USER_MARK = ".user"  # file in the folder of a part that did not come from config/parts.yaml
 
 
 class PartError(ValueError):
     """One line: which part or file is wrong, why, what to do."""
+
+
+def one_line(error: Exception) -> str:
+    """An exception's message without line breaks."""
+    return " ".join(str(error).split())
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ def make_part(
     density: float | None = None,
     mass: float | None = None,
 ) -> Part:
-    """A part from its mesh in any frame; homogeneous, of the given density (kg/m^3) or mass (kg)."""
+    """A part from its mesh in any frame; homogeneous, of a density (kg/m^3) or a mass (kg)."""
     transform = library_axes(mesh)
     mesh = mesh.copy()
     mesh.apply_transform(transform)
@@ -128,8 +135,9 @@ def load_part(folder: Path) -> Part:
     except FileNotFoundError as error:
         raise PartError(f"{error.filename}: no such file; run scripts/setup") from None
     except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise PartError(f"{path}: not a part description ({reason}); run scripts/setup") from None
+        raise PartError(
+            f"{path}: not a part description ({one_line(error)}); run scripts/setup"
+        ) from None
     return part
 
 
@@ -140,7 +148,7 @@ def configured_parts(config: Path) -> Iterator[Part]:
     except FileNotFoundError:
         raise PartError(f"{config}: no such file") from None
     except yaml.YAMLError as error:
-        raise PartError(f"{config}: {' '.join(str(error).split())}") from None
+        raise PartError(f"{config}: {one_line(error)}") from None
     try:
         densities, tolerance = settings["densities"], float(settings["piece_tolerance"])
         groups = {kind: settings[kind] for kind in settings if kind in KINDS}
@@ -178,14 +186,15 @@ def part_from_description(description: Path) -> Part:
     """A user's part from YAML: `name`, `mesh` (file beside the YAML: STL, OBJ, PLY, OFF), `unit`
     (m, cm, mm), `density` (kg/m^3) or `mass` (kg), `family` (default: the name).
 
-    The mesh must be closed and fit workspace and robot. Convex pieces come from CoACD. Raises PartError.
+    The mesh must be closed and fit workspace and robot. Convex pieces come from CoACD.
+    Raises PartError.
     """
     try:
         d = yaml.safe_load(description.read_text())
     except FileNotFoundError:
         raise PartError(f"{description}: no such file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise PartError(f"{description}: {' '.join(str(error).split())}") from None
+        raise PartError(f"{description}: {one_line(error)}") from None
     if not isinstance(d, dict):
         raise PartError(f"{description}: must hold keys {', '.join(sorted(_USER_KEYS))}")
     unknown = set(d) - _USER_KEYS
@@ -197,7 +206,7 @@ def part_from_description(description: Path) -> Part:
     name = str(d["name"])
     if not name or not all(c.isalnum() or c in "_-" for c in name):
         raise PartError(f"{description}: name '{name}' may hold letters, digits, '_' and '-' only")
-    if d["unit"] not in _UNITS:
+    if str(d["unit"]) not in _UNITS:
         raise PartError(f"{description}: unit '{d['unit']}' is none of m, cm, mm")
     given = [k for k in ("density", "mass") if k in d]
     if len(given) != 1:
@@ -212,7 +221,7 @@ def part_from_description(description: Path) -> Part:
     try:
         mesh = trimesh.load(path, force="mesh")
     except Exception as error:  # trimesh's loaders raise whatever their format's parser raises
-        raise PartError(f"{path}: cannot be read as a mesh ({' '.join(str(error).split())})") from None
+        raise PartError(f"{path}: cannot be read as a mesh ({one_line(error)})") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise PartError(f"{path}: holds no triangles")
     mesh.apply_scale(_UNITS[d["unit"]])
@@ -226,11 +235,13 @@ def part_from_description(description: Path) -> Part:
         raise PartError(
             f"{path}: {longest:.0f} mm long, more than {1e3 * LONGEST:.0f} mm; is its unit right?"
         )
-    if shortest < 2.0:
+    if shortest < 1e3 * THINNEST:
         raise PartError(f"{path}: only {shortest:.2g} mm thick; is its unit right?")
     mass = amount if given[0] == "mass" else amount * mesh.volume
     if mass > HEAVIEST:
-        raise PartError(f"{description}: {mass:.1f} kg, more than the robot carries ({HEAVIEST} kg)")
+        raise PartError(
+            f"{description}: {mass:.1f} kg, more than the robot carries ({HEAVIEST} kg)"
+        )
     return make_part(name, str(d.get("family", name)), mesh, convex_pieces(mesh), mass=mass)
 
 
@@ -250,13 +261,12 @@ def add_part(description: Path, library: Path) -> Part:
     part = part_from_description(description)
     configured = library / part.name / "part.yaml"
     if configured.is_file() and not (library / part.name / USER_MARK).is_file():
-        raise PartError(f"{description}: '{part.name}' is a part of config/parts.yaml; choose another name")
+        raise PartError(
+            f"{description}: '{part.name}' is a part of config/parts.yaml; choose another name"
+        )
     save_part(part, library)
     (library / part.name / USER_MARK).touch()
     return part
-
-
-USER_MARK = ".user"  # file in the folder of a part that did not come from config/parts.yaml
 
 
 def keep_user_parts(old: Path, new: Path) -> None:

@@ -38,10 +38,10 @@ def filled_corners(outline: CrossSection, radius: float) -> CrossSection:
 
 
 def sectors(radius: float, tolerance: float) -> int:
-    """Into how many convex pieces a ring is cut so that no chord strays from its bore by more
-    than `tolerance`: half the sagitta r (1 - cos(pi / n)), see ring_sectors."""
+    """Into how many convex pieces a ring is cut so that their inner faces stray from the bore by
+    at most `tolerance` (m), see ring_sectors."""
     n = 6
-    while radius * (1 - np.cos(np.pi / n)) / 2 > tolerance:
+    while radius * np.tan(np.pi / n / 2) ** 2 > tolerance:
         n += 1
     return n
 
@@ -51,11 +51,11 @@ def ring_sectors(
 ) -> list[CrossSection]:
     """Convex sectors of a ring; the bore stays open.
 
-    The inner face of a convex sector is a chord. It is laid half its sagitta outside the bore's
-    circle at its middle's side, so that it strays by the same amount to both sides."""
+    The inner face of a convex sector is a chord. Its corners lie as far outside the bore's circle
+    as its middle lies inside: by r (1 - c) / (1 + c) = r tan^2(pi / 2n), with c = cos(pi / n)."""
     inner, outer = bore / 2, diameter / 2
     n = sectors(inner, tolerance)
-    inner *= 2 / (1 + np.cos(np.pi / n))  # corners outside by as much as the middle is inside
+    inner *= 2 / (1 + np.cos(np.pi / n))
     pieces = []
     for i in range(n):
         arc = 2 * np.pi * (i + np.linspace(0, 1, 4)) / n
