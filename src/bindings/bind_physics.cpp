@@ -179,6 +179,13 @@ void bind_physics(py::module_& m) {
             for (const auto& model : c.models()) families.push_back(model.family);
             return families;
           })
+      .def(
+          "unoccluded_areas",
+          [](SimulatedCell& c) {
+            py::gil_scoped_release release;
+            return c.unoccluded_areas();
+          },
+          "px that each part would cover with nothing before it")
       .def("show_parts", &SimulatedCell::show_parts, "shown"_a,
            "Whether the camera sees the parts; the physics keeps them.")
       .def("set_light", &SimulatedCell::set_light, "light"_a)

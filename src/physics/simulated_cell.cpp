@@ -428,6 +428,29 @@ cv::Mat SimulatedCell::part_mask() {
   return instances;
 }
 
+std::vector<double> SimulatedCell::unoccluded_areas() {
+  constexpr int kReduction = 4;
+  Impl& m = *impl_;
+  m.sync();
+  PinholeIntrinsics k = m.camera.color;
+  k.width /= kReduction;
+  k.height /= kReduction;
+  k.fx /= kReduction;
+  k.fy /= kReduction;
+  k.cx = (k.cx + 0.5) / kReduction - 0.5;
+  k.cy = (k.cy + 0.5) / kReduction - 0.5;
+  std::vector<double> areas;
+  show_parts(false);
+  for (const int instance : m.part_instances) {
+    m.renderer.set_visible(instance, true);
+    const cv::Mat seen = m.renderer.instances(k, m.camera.T_base_color) == instance;
+    areas.push_back(cv::countNonZero(seen) * double(kReduction) * kReduction);
+    m.renderer.set_visible(instance, false);
+  }
+  show_parts(true);
+  return areas;
+}
+
 void SimulatedCell::show_parts(bool shown) {
   for (const int instance : impl_->part_instances) impl_->renderer.set_visible(instance, shown);
 }

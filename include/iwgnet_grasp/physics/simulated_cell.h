@@ -60,6 +60,9 @@ class SimulatedCell {
   const std::vector<PartModel>& models() const;  // of the scene's parts, by index
   cv::Mat ideal_depth();                  // CV_32FC1 m, colour frame, no noise
   cv::Mat part_mask();                    // CV_32SC1, colour frame: index of the part seen, or -1
+  // Pixels that each part would cover in the colour image with nothing before it (its outline
+  // within the image), counted at a quarter of the resolution.
+  std::vector<double> unoccluded_areas();
   void show_parts(bool shown);            // to the camera; the physics keeps them
   void set_light(const sensing::Light& light);
   void set_part_material(int part, const sensing::Material& material);

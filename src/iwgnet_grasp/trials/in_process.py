@@ -1,6 +1,6 @@
 """Trials in one process: the simulated cell, perception and planning without ROS.
 
-    python -m iwgnet_grasp.trials.in_process --scene five_scattered --seed 0 --replan every --out DIR
+    python -m iwgnet_grasp.trials.in_process --scene five_scattered --seed 0 --out DIR
 
 The cell's clock stands still while perception and planning compute; trial.json tells that wall
 time apart. The same seed gives the same trial to the bit.
