@@ -118,4 +118,6 @@ CellConfig load_cell_config(const std::string& config_dir) {
   return cell;
 }
 
+Pose load_camera_pose(const std::string& path) { return pose(YamlFile(path), "T_base_color"); }
+
 }  // namespace iwgnet_grasp

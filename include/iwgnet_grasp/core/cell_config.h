@@ -61,5 +61,7 @@ struct CellConfig {
 
 // Reads cell.yaml and camera.yaml of a folder. Throws Error naming file, key and remedy.
 CellConfig load_cell_config(const std::string& config_dir);
+// Key T_base_color {rotation, translation} of a camera.yaml or a calibration result. Throws Error.
+Pose load_camera_pose(const std::string& path);
 
 }  // namespace iwgnet_grasp

@@ -1,7 +1,6 @@
 // From a grasp in the image to a grasp pose of the gripper (three stages of section 2.2, Eq. 5).
 #pragma once
 
-#include <opencv2/core.hpp>
 #include <string>
 #include <vector>
 
@@ -19,29 +18,45 @@ struct GraspRectangle {
 };
 
 struct GraspPose {
-  Pose T_base_tcp = Pose::Identity();  // x = closing direction, z = approach (down)
+  // TCP once the gap is `width`: T_base_tool0 = T_base_tcp * T_tool0_tcp(width).inverse(), also
+  // while the gripper is open (its tips are higher then). x = closing direction, z = approach (down).
+  Pose T_base_tcp = Pose::Identity();
   double width = 0.0;                  // m, expected gap on the object (Eq. 5)
   double opening = 0.0;                // m, gap to approach with
   double quality = 0.0;
+  double tip_height = 0.0;             // m, finger tips over base_link's z = 0 once closed
+  double engagement = 0.0;             // m, overlap of finger and object along the approach
   bool feasible = false;
   std::string reason;                  // one line, when not feasible
 };
 
-struct GraspPoseConfig {  // config/grasping.yaml
+struct GripperBody {             // of the gripper, over a rectangle around the approach axis
+  Eigen::Vector2d half;          // m, along and across the closing direction
+  double above_tips;             // m, its lowest point above the tips
+};
+
+struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double opening_margin;     // m, added to the width for the approach
+  double side_clearance;     // m, least play a side when a neighbour leaves no room for the margin
   double max_opening;        // m
   double insertion_depth;    // m, finger tips below the surface at the grasp point
   double min_engagement;     // m, least overlap of finger and object
   double floor_clearance;    // m, finger tips above whatever lies under them
+  double border;             // m, how far outside the workspace a grasp may lie
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
+  // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
+  std::vector<Eigen::Vector2d> finger_outline;
+  std::vector<GripperBody> body;
 };
 GraspPoseConfig load_grasp_pose_config(const std::string& config_dir);  // Throws Error.
 
 // Eq. 5: pixels to metres at depth z.
 double width_in_metres(double width_px, double depth_m, double fx_px);
 
-// Pixel -> camera -> base -> pose; opening and depth are chosen so that the fingers clear what
-// lies beside the object in `heights`. Never throws for a bad grasp: feasible is false and
+// Pixel -> camera -> base -> pose. The object's surface is the highest that `heights` shows along
+// the closing line, so that a centre over a bore or without a measurement still finds the object.
+// The tips go as deep as the insertion depth allows and what lies under their sweep from the
+// opening to the object permits; where a neighbour is close, the opening shrinks. Never throws for a bad grasp: feasible is false and
 // reason says why (no depth, outside the workspace, wider than the gripper, fingers collide).
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                      const Pose& T_base_camera, const HeightMap& heights,

@@ -1,0 +1,254 @@
+// Node 4: plans and executes one pick and place at a time through the arm's trajectory controller
+// and gripper_control.
+#include <actionlib/server/simple_action_server.h>
+#include <control_msgs/FollowJointTrajectoryAction.h>
+#include <iwgnet_grasp/GraspPoses.h>
+#include <iwgnet_grasp/GripAction.h>
+#include <iwgnet_grasp/PickPlaceAction.h>
+#include <iwgnet_grasp/Scene.h>
+#include <iwgnet_grasp/Topics.h>
+#include <std_srvs/Trigger.h>
+#include <tf2_ros/transform_listener.h>
+
+#include <atomic>
+#include <mutex>
+
+#include "action_call.h"
+#include "camera_transform.h"
+#include "conversions.h"
+#include "iwgnet_grasp/motion/pick_and_place.h"
+#include "node_setup.h"
+
+namespace iwgnet_grasp::nodes {
+namespace {
+
+using control_msgs::FollowJointTrajectoryAction;
+
+// The robot behind its ROS drivers.
+class RosRobot : public motion::Robot {
+ public:
+  explicit RosRobot(double held_gap_min)
+      : held_gap_min_(held_gap_min), arm_(Topics::ARM_ACTION, false), gripper_(Topics::GRIP, false) {
+    joints_subscriber_ =
+        node_.subscribe(Topics::JOINT_STATES, 10, &RosRobot::on_joints, this,
+                        ros::TransportHints().tcpNoDelay());
+  }
+
+  // Object that the gripper's commands are for, and what asks to give up.
+  void begin(std::uint32_t scene_id, std::uint32_t object_id, std::function<bool()> cancelled) {
+    grip_goal_.scene_id = scene_id;
+    grip_goal_.object_id = object_id;
+    cancelled_ = std::move(cancelled);
+    closed_ = false;
+  }
+
+  JointVector joints() override {
+    const ros::WallTime start = ros::WallTime::now();
+    while (ros::ok()) {
+      {
+        const std::lock_guard lock(mutex_);
+        if (ros::WallTime::now() - joints_time_ < ros::WallDuration(1.0)) return joints_;
+      }
+      if (ros::WallTime::now() - start > ros::WallDuration(5.0))
+        throw Error("no joint state of the arm on " + Topics::JOINT_STATES +
+                    " for 5 s: is the arm's driver running?");
+      ros::WallDuration(0.002).sleep();
+    }
+    throw Error("the node is shutting down");
+  }
+
+  motion::ExecutionResult execute(const motion::Trajectory& trajectory) override {
+    control_msgs::FollowJointTrajectoryGoal goal;
+    goal.trajectory = to_message(trajectory);
+    goal.trajectory.header.frame_id = Topics::BASE_FRAME;
+    const double duration = trajectory.empty() ? 0.0 : trajectory.back().time;
+    const auto outcome = call_action(arm_, Topics::ARM_ACTION, goal, ros::Duration(duration + 10.0),
+                                     cancelled_);
+    if (!outcome.finished) return {false, outcome.message};
+    if (outcome.succeeded) return {true, ""};
+    return {false, "the arm's controller gave up: " + outcome.result.error_string +
+                       (outcome.result.error_string.empty() ? outcome.message : "")};
+  }
+
+  motion::GripResult grip(double gap_m, double /*force_n: topic 4 carries it*/) override {
+    GripGoal goal = grip_goal_;
+    if (gap_m < held_gap_min_) {
+      goal.command = GripGoal::CLOSE;
+      closed_ = true;
+    } else {
+      goal.command = closed_ ? GripGoal::RELEASE : GripGoal::OPEN;
+      goal.gap = gap_m;
+    }
+    const auto outcome = call_action(gripper_, Topics::GRIP, goal, ros::Duration(30.0), cancelled_);
+    motion::GripResult result;
+    result.success = outcome.finished && outcome.succeeded;
+    result.stalled = outcome.result.stalled;
+    result.gap = outcome.result.gap;
+    result.message = outcome.message;
+    return result;
+  }
+
+ private:
+  void on_joints(const sensor_msgs::JointState::ConstPtr& state) {
+    const auto joints = arm_joints(*state);
+    if (!joints) return;  // the gripper's own joint state
+    const std::lock_guard lock(mutex_);
+    joints_ = *joints;
+    joints_time_ = ros::WallTime::now();
+  }
+
+  const double held_gap_min_;
+  ros::NodeHandle node_;
+  ros::Subscriber joints_subscriber_;
+  std::mutex mutex_;
+  JointVector joints_ = JointVector::Zero();
+  ros::WallTime joints_time_;
+  actionlib::SimpleActionClient<FollowJointTrajectoryAction> arm_;
+  actionlib::SimpleActionClient<GripAction> gripper_;
+  GripGoal grip_goal_;
+  std::function<bool()> cancelled_;
+  bool closed_ = false;
+};
+
+class MotionControl {
+ public:
+  MotionControl()
+      : cell_(load_cell_config(config_dir())),
+        config_(motion::load_pick_place_config(config_dir())),
+        pick_and_place_(cell_, config_),
+        robot_(config_.held_gap_min),
+        transforms_(buffer_),
+        server_(Topics::PICK_PLACE, [this](const PickPlaceGoalConstPtr& goal) { pick(*goal); },
+                false) {
+    scene_subscriber_ = node_.subscribe(Topics::SCENE, 1, &MotionControl::on_scene, this);
+    poses_subscriber_ = node_.subscribe(Topics::GRASP_POSE, 2, &MotionControl::on_poses, this);
+    observe_service_ = node_.advertiseService(Topics::OBSERVE, &MotionControl::observe, this);
+    server_.start();
+  }
+
+ private:
+  void on_scene(const Scene::ConstPtr& scene) {
+    const std::lock_guard lock(mutex_);
+    scene_ = scene;
+  }
+
+  void on_poses(const GraspPoses::ConstPtr& poses) {
+    const std::lock_guard lock(mutex_);
+    poses_ = poses;
+  }
+
+  // The grasp of a goal with the heights of its scene given to the planner.
+  motion::PickRequest request_for(const PickPlaceGoal& goal) {
+    GraspPoses::ConstPtr poses;
+    Scene::ConstPtr scene;
+    {
+      const std::lock_guard lock(mutex_);
+      poses = poses_;
+      scene = scene_;
+    }
+    const std::string which = "object " + std::to_string(goal.object_id) + " of scene " +
+                              std::to_string(goal.scene_id);
+    const int slots = cell_.tray.columns * cell_.tray.rows;
+    if (goal.tray_slot >= static_cast<std::uint32_t>(slots))
+      throw Error("tray slot " + std::to_string(goal.tray_slot) + " does not exist: the tray has " +
+                  std::to_string(slots));
+    if (!poses || poses->scene_id != goal.scene_id)
+      throw Error(Topics::GRASP_POSE + " holds nothing for " + which);
+    if (poses->header.frame_id != Topics::BASE_FRAME)
+      throw Error(Topics::GRASP_POSE + " is in frame '" + poses->header.frame_id + "', expected '" +
+                  Topics::BASE_FRAME + "'");
+    if (!scene || scene->scene_id != goal.scene_id)
+      throw Error(Topics::SCENE + " holds no depth for " + which);
+    for (const GraspPose& grasp : poses->grasps) {
+      if (grasp.object_id != goal.object_id) continue;
+      if (scene_with_heights_ != scene) {
+        const cv::Mat depth = depth_image(scene->depth, Topics::SCENE);
+        pick_and_place_.set_heights(grasping::HeightMap(
+            depth, from_message(scene->camera_info),
+            camera_transform(buffer_, scene->header.frame_id), cell_));
+        scene_with_heights_ = scene;
+      }
+      return {from_message(grasp), from_message(grasp.centroid), static_cast<int>(goal.tray_slot)};
+    }
+    throw Error(Topics::GRASP_POSE + " holds nothing for " + which);
+  }
+
+  void pick(const PickPlaceGoal& goal) {
+    const std::lock_guard motion_lock(motion_mutex_);
+    PickPlaceResult result;
+    result.reason = PickPlaceResult::UNKNOWN_GRASP;
+    try {
+      const motion::PickRequest request = request_for(goal);
+      result.reason = PickPlaceResult::EXECUTION_FAILED;  // of an Error thrown below
+      const auto cancelled = [this] { return server_.isPreemptRequested() || !ros::ok(); };
+      robot_.begin(goal.scene_id, goal.object_id, cancelled);
+      const motion::PickResult picked =
+          pick_and_place_.run(robot_, request, [&](const std::string& phase) {
+            PickPlaceFeedback feedback;
+            feedback.phase = phase;
+            server_.publishFeedback(feedback);
+            return !cancelled();
+          });
+      result.success = picked.reason == motion::PickReason::kSucceeded;
+      result.reason = static_cast<std::uint8_t>(picked.reason);
+      result.message = picked.message;
+      ROS_INFO("motion_control: scene %u object %u: %s (planned in %.0f ms)", goal.scene_id,
+               goal.object_id, result.success ? "done" : result.message.c_str(),
+               picked.planning_seconds * 1e3);
+    } catch (const Error& error) {
+      result.message = error.what();
+    }
+    if (!result.success) ROS_WARN("motion_control: pick refused or failed: %s", result.message.c_str());
+    if (server_.isPreemptRequested())
+      server_.setPreempted(result, result.message);
+    else if (result.success)
+      server_.setSucceeded(result, result.message);
+    else
+      server_.setAborted(result, result.message);
+  }
+
+  bool observe(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {
+    const std::unique_lock motion_lock(motion_mutex_, std::try_to_lock);
+    if (!motion_lock) {
+      response.message = "a pick is under way: wait for it or cancel it first";
+      return true;
+    }
+    try {
+      robot_.begin(0, 0, [] { return !ros::ok(); });
+      const motion::PickResult result = pick_and_place_.observe(robot_);
+      response.success = result.reason == motion::PickReason::kSucceeded;
+      response.message = result.message;
+    } catch (const Error& error) {
+      response.message = error.what();
+    }
+    if (!response.success) ROS_ERROR("motion_control: observe: %s", response.message.c_str());
+    return true;
+  }
+
+  const CellConfig cell_;
+  const motion::PickPlaceConfig config_;
+  motion::PickAndPlace pick_and_place_;
+  RosRobot robot_;
+  std::mutex motion_mutex_;  // one motion at a time
+  std::mutex mutex_;         // of the messages below
+  Scene::ConstPtr scene_, scene_with_heights_;
+  GraspPoses::ConstPtr poses_;
+  ros::NodeHandle node_;
+  tf2_ros::Buffer buffer_;
+  tf2_ros::TransformListener transforms_;
+  ros::Subscriber scene_subscriber_, poses_subscriber_;
+  ros::ServiceServer observe_service_;
+  actionlib::SimpleActionServer<PickPlaceAction> server_;
+};
+
+}  // namespace
+}  // namespace iwgnet_grasp::nodes
+
+int main(int argc, char** argv) {
+  return iwgnet_grasp::nodes::run_node(argc, argv, "motion_control", [] {
+    iwgnet_grasp::nodes::MotionControl motion;
+    ros::AsyncSpinner spinner(4);
+    spinner.start();
+    ros::waitForShutdown();
+  });
+}
