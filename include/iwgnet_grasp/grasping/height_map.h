@@ -13,9 +13,10 @@ class HeightMap {
   HeightMap() = default;
   // depth: CV_32FC1 m, NaN invalid; the highest point of each cell counts; cells without any
   // measurement take the highest of their measured neighbours. Points outside the workspace
-  // rectangle (widened by `border`) are left out.
+  // rectangle (widened by `border`) are left out: it lets the fingers of a grasp at the rim be
+  // checked. Throws Error when image and camera do not match.
   HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,
-            const CellConfig& cell, double resolution = 0.002, double border = 0.05);
+            const CellConfig& cell, double resolution = 0.002, double border = 0.11);
 
   double at(double x, double y) const;  // m above base_link's z = 0; 0 outside the map
   // Highest value within an oriented rectangle: centre, yaw, half extents (m).

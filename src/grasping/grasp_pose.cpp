@@ -1,0 +1,306 @@
+#include "iwgnet_grasp/grasping/grasp_pose.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+
+#include "iwgnet_grasp/core/yaml.h"
+#include "iwgnet_grasp/kinematics/robotiq_2f85.h"
+#include "iwgnet_grasp/sensing/pinhole.h"
+
+namespace iwgnet_grasp::grasping {
+namespace {
+
+using kinematics::finger_tip_height;
+
+constexpr double kStep = 0.001;           // m, between the depths and the gaps that are tried
+constexpr double kLineHalfWidth = 0.005;  // m, of the band along the closing line that is measured
+constexpr double kSurfaceShare = 0.8;     // of the band's heights lie below what counts as surface
+// Fingers are looked for outside this share of the predicted width; nearer to the centre a free
+// place is a bore or a recess of the object itself.
+constexpr double kCoreShare = 0.7;
+
+struct GraspAxes {
+  Eigen::Vector2d center, along, across;  // base_link, m
+};
+
+Eigen::Vector3d to_base(const PinholeIntrinsics& camera, const Pose& T, double u, double v, double z) {
+  return T * sensing::deproject(camera, u, v, z);
+}
+
+// The point at height z on the pixel's line of sight.
+Eigen::Vector3d at_height(const PinholeIntrinsics& camera, const Pose& T, double u, double v,
+                          double z) {
+  const Eigen::Vector3d ray = T.rotation() * sensing::deproject(camera, u, v, 1.0);
+  return T.translation() + ray * ((z - T.translation().z()) / ray.z());
+}
+
+GraspAxes axes_at(const GraspRectangle& grasp, const PinholeIntrinsics& camera, const Pose& T,
+                  double height) {
+  // Image rows grow downwards: a counter-clockwise angle turns towards smaller rows.
+  const double du = std::cos(grasp.theta_rad), dv = -std::sin(grasp.theta_rad);
+  const Eigen::Vector3d p = at_height(camera, T, grasp.x_px, grasp.y_px, height);
+  const Eigen::Vector3d q = at_height(camera, T, grasp.x_px + du, grasp.y_px + dv, height);
+  GraspAxes axes;
+  axes.center = p.head<2>();
+  axes.along = (q - p).head<2>().normalized();
+  axes.across = {-axes.along.y(), axes.along.x()};
+  return axes;
+}
+
+// Height of the object's surface along the closing line over the grasp's width.
+double surface_height(const HeightMap& heights, const GraspAxes& axes, double width) {
+  const double step = heights.resolution() / 2;
+  const int n = std::max(1, static_cast<int>(width / 2 / step));
+  const int m = std::max(1, static_cast<int>(kLineHalfWidth / step));
+  std::vector<double> samples;
+  samples.reserve((2 * n + 1) * (2 * m + 1));
+  for (int i = -n; i <= n; ++i)
+    for (int j = -m; j <= m; ++j) {
+      const Eigen::Vector2d p = axes.center + axes.along * (i * step) + axes.across * (j * step);
+      samples.push_back(heights.at(p.x(), p.y()));
+    }
+  const auto rank = samples.begin() + static_cast<std::ptrdiff_t>(kSurfaceShare * (samples.size() - 1));
+  std::nth_element(samples.begin(), rank, samples.end());
+  return *rank;
+}
+
+// What lies beside the grasp's centre, as a finger meets it: the highest point over the pad's
+// width at each distance from the centre along the closing line, on either side.
+class SideProfile {
+ public:
+  SideProfile(const HeightMap& heights, const GraspAxes& axes, double reach, double side_clearance)
+      : step_(heights.resolution()) {
+    const double half = kinematics::kPadWidth / 2 + side_clearance;
+    const int across = static_cast<int>(std::ceil(half / step_));
+    const int count = static_cast<int>(std::ceil(reach / step_)) + 1;
+    for (int side = 0; side < 2; ++side) {
+      heights_[side].resize(count);
+      for (int i = 0; i < count; ++i) {
+        const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step_);
+        double highest = 0.0;
+        for (int j = -across; j <= across; ++j) {
+          const Eigen::Vector2d q = p + axes.across * (half * j / across);
+          highest = std::max(highest, heights.at(q.x(), q.y()));
+        }
+        heights_[side][i] = highest;
+      }
+    }
+  }
+
+  // Highest point at distances [from, to] on a side.
+  double highest(int side, double from, double to) const {
+    const auto& h = heights_[side];
+    const int last = std::min<int>(h.size() - 1, std::ceil(to / step_));
+    double highest = 0.0;
+    for (int i = std::max(0, static_cast<int>(std::floor(from / step_))); i <= last; ++i)
+      highest = std::max(highest, h[i]);
+    return highest;
+  }
+  int count() const { return static_cast<int>(heights_[0].size()); }
+  double step() const { return step_; }
+  double at(int side, int i) const { return heights_[side][i]; }
+
+ private:
+  double step_;
+  std::array<std::vector<double>, 2> heights_;
+};
+
+// The lowest point of a finger's outer side, above its tip, at a distance outwards from its face.
+double underside(const GraspPoseConfig& config, double outwards) {
+  if (outwards <= config.finger_thickness) return 0.0;
+  Eigen::Vector2d before(config.finger_thickness, 0.0);
+  for (const Eigen::Vector2d& corner : config.finger_outline) {
+    if (outwards <= corner.x())
+      return before.y() + (corner.y() - before.y()) * (outwards - before.x()) /
+                              (corner.x() - before.x());
+    before = corner;
+  }
+  return std::numeric_limits<double>::infinity();
+}
+
+// Whether both fingers, tips at `tip` once the gap is `closed`, fit beside the object at `gap`.
+bool fits(const SideProfile& profile, int side, const GraspPoseConfig& config, double tip,
+          double closed, double gap) {
+  const double raised = tip + finger_tip_height(closed) - finger_tip_height(gap);
+  const int first = static_cast<int>(std::ceil(gap / 2 / profile.step() - 1e-9));
+  for (int i = first; i < profile.count(); ++i) {
+    const double lowest = underside(config, i * profile.step() - gap / 2);
+    if (!std::isfinite(lowest)) break;
+    if (profile.at(side, i) + config.floor_clearance > raised + lowest) return false;
+  }
+  return true;
+}
+
+std::string millimetres(double metres) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%.0f mm", metres * 1e3);
+  return text;
+}
+
+struct Descent {
+  bool found = false;
+  double tip, contact, opening;  // m: tips' height once closed, gap on the object, gap to approach with
+};
+
+// Deepest position of the tips at which both fingers find room.
+Descent descend(const SideProfile& profile, const GraspPoseConfig& config, double surface,
+                double width) {
+  for (double engaged = config.insertion_depth; engaged >= config.min_engagement - 1e-9;
+       engaged -= kStep) {
+    const double tip = surface - engaged;
+    if (tip < config.floor_clearance) continue;
+    // Contact: on each side the nearest place to the centre where the finger stands free.
+    double contact = 0.0;
+    for (int side = 0; side < 2 && contact <= config.max_opening; ++side) {
+      double gap = std::max(kCoreShare * width, contact);
+      while (gap <= config.max_opening && !fits(profile, side, config, tip, gap, gap)) gap += 2 * kStep;
+      contact = gap;
+    }
+    // The other side has moved on: both must be free at the common gap and all the way out.
+    const double least = contact + 2 * config.side_clearance;
+    double opening = 0.0;
+    for (double gap = contact; gap <= std::min(config.max_opening, contact + config.opening_margin) + 1e-9;
+         gap += kStep) {
+      if (!fits(profile, 0, config, tip, contact, gap) || !fits(profile, 1, config, tip, contact, gap))
+        break;
+      opening = gap;
+    }
+    if (opening >= least - 1e-9) return {true, tip, contact, opening};
+  }
+  return {};
+}
+
+}  // namespace
+
+GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
+  const YamlFile file(config_dir + "/grasping.yaml");
+  GraspPoseConfig config;
+  const auto positive = [&](const std::string& key) {
+    const double value = file.get<double>("pose." + key);
+    if (!(value > 0)) file.fail("pose." + key, "must be positive");
+    return value;
+  };
+  config.opening_margin = positive("opening_margin");
+  config.side_clearance = positive("side_clearance");
+  config.max_opening = positive("max_opening");
+  config.insertion_depth = positive("insertion_depth");
+  config.min_engagement = positive("min_engagement");
+  config.floor_clearance = positive("floor_clearance");
+  config.border = file.get<double>("pose.border");
+  config.finger_thickness = positive("finger_thickness");
+  if (config.min_engagement > config.insertion_depth)
+    file.fail("pose.min_engagement", "must not exceed insertion_depth");
+  if (config.max_opening > kinematics::max_gap() + 1e-6)
+    file.fail("pose.max_opening", "exceeds what the gripper's linkage allows");
+  double last = config.finger_thickness;
+  for (const auto& corner : file.get<std::vector<std::vector<double>>>("pose.finger_outline")) {
+    if (corner.size() != 2 || corner[0] <= last)
+      file.fail("pose.finger_outline", "needs pairs [outwards, above the tip], outwards increasing");
+    config.finger_outline.emplace_back(corner[0], corner[1]);
+    last = corner[0];
+  }
+  for (const auto& body : file.node("pose.body")) {
+    try {
+      const auto half = body["half"].as<std::vector<double>>();
+      config.body.push_back({{half.at(0), half.at(1)}, body["above_tips"].as<double>()});
+    } catch (const std::exception&) {
+      file.fail("pose.body", "needs entries {half: [along, across], above_tips: height}");
+    }
+  }
+  return config;
+}
+
+double width_in_metres(double width_px, double depth_m, double fx_px) {
+  return depth_m * width_px / fx_px;
+}
+
+GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+                     const Pose& T_base_camera, const HeightMap& heights,
+                     const CellConfig& cell, const GraspPoseConfig& config) {
+  GraspPose pose;
+  pose.quality = grasp.quality;
+  const auto infeasible = [&](std::string reason) {
+    pose.feasible = false;
+    pose.reason = std::move(reason);
+    return pose;
+  };
+  const bool finite = std::isfinite(grasp.x_px) && std::isfinite(grasp.y_px) &&
+                      std::isfinite(grasp.theta_rad) && std::isfinite(grasp.width_px);
+  if (!finite || grasp.width_px <= 0) return infeasible("grasp has no position, angle or width");
+  if (grasp.x_px < 0 || grasp.y_px < 0 || grasp.x_px > camera.width - 1 ||
+      grasp.y_px > camera.height - 1)
+    return infeasible("grasp lies outside the image");
+  if (heights.grid().empty()) return infeasible("no depth: the height map is empty");
+
+  // Stages 1 and 2, pixel -> camera -> base. The measured depth starts the search for the surface;
+  // the height map then replaces it where it is missing, noisy or looks through a bore.
+  const bool measured = std::isfinite(grasp.depth_m) && grasp.depth_m > 0;
+  double surface = measured ? to_base(camera, T_base_camera, grasp.x_px, grasp.y_px, grasp.depth_m).z()
+                            : config.min_engagement + config.floor_clearance;
+  GraspAxes axes;
+  for (int i = 0; i < 3; ++i) {
+    axes = axes_at(grasp, camera, T_base_camera, surface);
+    const double depth =
+        (T_base_camera.inverse() * Eigen::Vector3d(axes.center.x(), axes.center.y(), surface)).z();
+    if (!(depth > 0)) return infeasible("the surface at the grasp is not in front of the camera");
+    pose.width = width_in_metres(grasp.width_px, depth, camera.fx);
+    surface = surface_height(heights, axes, std::min(pose.width, config.max_opening));
+  }
+  axes = axes_at(grasp, camera, T_base_camera, surface);
+  const Eigen::Vector2d low = cell.workspace_min.array() - config.border;
+  const Eigen::Vector2d high = cell.workspace_max.array() + config.border;
+  if ((axes.center.array() < low.array()).any() || (axes.center.array() > high.array()).any())
+    return infeasible("grasp lies outside the workspace");
+  if (pose.width > config.max_opening)
+    return infeasible("object is " + millimetres(pose.width) + " wide there, the gripper opens " +
+                      millimetres(config.max_opening));
+  if (surface < config.min_engagement + config.floor_clearance)
+    return infeasible("nothing high enough to grip at the grasp point: surface is " +
+                      millimetres(surface) + " above the table");
+
+  // Stage 3: depth and opening.
+  const double reach = config.max_opening / 2 + config.finger_outline.back().x();
+  const SideProfile profile(heights, axes, reach, config.side_clearance);
+  const Descent descent = descend(profile, config, surface, pose.width);
+  if (!descent.found) return infeasible("fingers find no room beside the object");
+  const double yaw = std::atan2(axes.along.y(), axes.along.x());
+  const double open_tip =
+      descent.tip + finger_tip_height(descent.contact) - finger_tip_height(descent.opening);
+  // The body is lowest over the scene when the fingers have closed and the tool is at its depth;
+  // it does not move between: open tips measure it.
+  for (const GripperBody& body : config.body)
+    if (heights.max_in(axes.center, yaw, body.half) + config.floor_clearance >
+        open_tip + body.above_tips)
+      return infeasible("the gripper's body would touch what lies beside the object");
+
+  pose.opening = descent.opening;
+  pose.tip_height = descent.tip;
+  pose.engagement = surface - descent.tip;
+  const double tool_height = descent.tip + finger_tip_height(descent.contact);
+  pose.T_base_tcp.translation() << axes.center,
+      tool_height - kinematics::pad_center_height(pose.width);
+  pose.T_base_tcp.linear().col(0) << axes.along, 0.0;
+  pose.T_base_tcp.linear().col(1) << axes.along.y(), -axes.along.x(), 0.0;
+  pose.T_base_tcp.linear().col(2) << 0.0, 0.0, -1.0;
+  pose.feasible = true;
+  return pose;
+}
+
+GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
+                          const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                          const HeightMap& heights, const CellConfig& cell,
+                          const GraspPoseConfig& config) {
+  GraspPose first;
+  first.reason = "no grasp was found for the object";
+  for (std::size_t i = 0; i < candidates.size(); ++i) {
+    GraspPose pose = grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config);
+    if (pose.feasible) return pose;
+    if (i == 0) first = std::move(pose);
+  }
+  return first;
+}
+
+}  // namespace iwgnet_grasp::grasping

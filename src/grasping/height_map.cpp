@@ -1,0 +1,127 @@
+#include "iwgnet_grasp/grasping/height_map.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "iwgnet_grasp/sensing/pinhole.h"
+
+namespace iwgnet_grasp::grasping {
+namespace {
+
+constexpr float kUnknown = -std::numeric_limits<float>::infinity();
+constexpr double kTallest = 0.35;  // m, what may lie on the table below the camera
+
+// Pixels that can show points of the rectangle between the table and kTallest.
+cv::Rect pixels_of(const Eigen::Vector2d& low, const Eigen::Vector2d& high,
+                   const PinholeIntrinsics& camera, const Pose& T_camera_base) {
+  const cv::Rect image(0, 0, camera.width, camera.height);
+  Eigen::Vector2d from(image.width, image.height), to(0, 0);
+  for (int corner = 0; corner < 8; ++corner) {
+    const Eigen::Vector3d p =
+        T_camera_base * Eigen::Vector3d(corner & 1 ? high.x() : low.x(),
+                                        corner & 2 ? high.y() : low.y(), corner & 4 ? kTallest : 0);
+    if (p.z() < 0.05) return image;  // beside or behind the camera
+    const Eigen::Vector2d px = sensing::project(camera, p);
+    from = from.cwiseMin(px);
+    to = to.cwiseMax(px);
+  }
+  const cv::Rect seen(cv::Point(std::floor(std::max(from.x(), 0.0)), std::floor(std::max(from.y(), 0.0))),
+                      cv::Point(std::ceil(std::min<double>(to.x() + 1, image.width)),
+                                std::ceil(std::min<double>(to.y() + 1, image.height))));
+  return seen & image;
+}
+
+// Fills unknown cells ring by ring with the highest of their known neighbours.
+void fill_unknown(cv::Mat& grid) {
+  std::vector<cv::Point> open;
+  for (int r = 0; r < grid.rows; ++r)
+    for (int c = 0; c < grid.cols; ++c)
+      if (grid.at<float>(r, c) == kUnknown) open.emplace_back(c, r);
+  if (open.size() == grid.total()) {
+    grid.setTo(0.0f);
+    return;
+  }
+  std::vector<std::pair<cv::Point, float>> filled;
+  std::vector<cv::Point> rest;
+  while (!open.empty()) {
+    filled.clear();
+    rest.clear();
+    for (const cv::Point& cell : open) {
+      float highest = kUnknown;
+      for (int r = std::max(cell.y - 1, 0); r <= std::min(cell.y + 1, grid.rows - 1); ++r)
+        for (int c = std::max(cell.x - 1, 0); c <= std::min(cell.x + 1, grid.cols - 1); ++c)
+          highest = std::max(highest, grid.at<float>(r, c));
+      if (highest == kUnknown)
+        rest.push_back(cell);
+      else
+        filled.emplace_back(cell, highest);
+    }
+    for (const auto& [cell, height] : filled) grid.at<float>(cell) = height;
+    open.swap(rest);
+  }
+}
+
+}  // namespace
+
+HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
+                     const Pose& T_base_camera, const CellConfig& cell, double resolution,
+                     double border)
+    : resolution_(resolution) {
+  if (depth.type() != CV_32FC1) throw Error("height map: needs a 32FC1 depth image in metres");
+  if (depth.cols != camera.width || depth.rows != camera.height)
+    throw Error("height map: depth image and camera info differ in size");
+  if (!(resolution > 0)) throw Error("height map: the resolution must be positive");
+  const Eigen::Vector2d low = cell.workspace_min.array() - border;
+  const Eigen::Vector2d high = cell.workspace_max.array() + border;
+  const int columns = static_cast<int>(std::ceil((high.x() - low.x()) / resolution));
+  const int rows = static_cast<int>(std::ceil((high.y() - low.y()) / resolution));
+  origin_ = low.array() + resolution / 2;
+  grid_.create(rows, columns, CV_32FC1);
+  grid_.setTo(kUnknown);
+
+  const cv::Rect seen = pixels_of(low, high, camera, T_base_camera.inverse());
+  const Eigen::Matrix3f R = T_base_camera.rotation().cast<float>();
+  const Eigen::Vector3f t = T_base_camera.translation().cast<float>();
+  const float x0 = low.x(), y0 = low.y(), scale = 1.0 / resolution;
+  for (int v = seen.y; v < seen.y + seen.height; ++v) {
+    const float* row = depth.ptr<float>(v);
+    const Eigen::Vector3f base = R.col(2) + R.col(1) * ((v - camera.cy) / camera.fy);
+    for (int u = seen.x; u < seen.x + seen.width; ++u) {
+      const float z = row[u];
+      if (!(z > 0.0f)) continue;
+      const Eigen::Vector3f p =
+          (base + R.col(0) * static_cast<float>((u - camera.cx) / camera.fx)) * z + t;
+      const float column = (p.x() - x0) * scale, line = (p.y() - y0) * scale;
+      if (!(column >= 0.0f && line >= 0.0f && column < columns && line < rows)) continue;
+      float& cell_height = grid_.ptr<float>(static_cast<int>(line))[static_cast<int>(column)];
+      cell_height = std::max(cell_height, p.z());
+    }
+  }
+  fill_unknown(grid_);
+}
+
+double HeightMap::at(double x, double y) const {
+  const double column = (x - origin_.x()) / resolution_ + 0.5;
+  const double row = (y - origin_.y()) / resolution_ + 0.5;
+  if (!(column >= 0.0 && row >= 0.0 && column < grid_.cols && row < grid_.rows)) return 0.0;
+  return grid_.ptr<float>(static_cast<int>(row))[static_cast<int>(column)];
+}
+
+double HeightMap::max_in(const Eigen::Vector2d& center, double yaw,
+                         const Eigen::Vector2d& half) const {
+  const Eigen::Vector2d along(std::cos(yaw), std::sin(yaw)), across(-along.y(), along.x());
+  const int nx = std::max(1, static_cast<int>(std::ceil(2 * half.x() / resolution_)));
+  const int ny = std::max(1, static_cast<int>(std::ceil(2 * half.y() / resolution_)));
+  double highest = 0.0;
+  for (int i = 0; i <= nx; ++i)
+    for (int j = 0; j <= ny; ++j) {
+      const Eigen::Vector2d p = center + along * (half.x() * (2.0 * i / nx - 1)) +
+                                across * (half.y() * (2.0 * j / ny - 1));
+      highest = std::max(highest, at(p.x(), p.y()));
+    }
+  return highest;
+}
+
+}  // namespace iwgnet_grasp::grasping
