@@ -297,6 +297,7 @@ GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
   first.reason = "no grasp was found for the object";
   for (std::size_t i = 0; i < candidates.size(); ++i) {
     GraspPose pose = grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config);
+    pose.candidate = static_cast<int>(i);
     if (pose.feasible) return pose;
     if (i == 0) first = std::move(pose);
   }

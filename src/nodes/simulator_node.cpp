@@ -614,6 +614,7 @@ class Simulator {
 
   bool on_judge(Judge::Request&, Judge::Response& response) {
     response.verdict_json = physics::to_json(cell_.verdict());
+    response.clock_offset = clock_offset_;
     return true;
   }
 

@@ -134,6 +134,10 @@ class SpatialTransform {
           grasping::best_grasp_pose(candidates, camera, T_base_camera, heights_, cell_, config_);
 
       GraspPose message = to_message(pose);
+      if (object.valid_pixels == 0) {
+        message.feasible = false;
+        message.reason = "no valid depth on the object";
+      }
       message.object_id = object.object_id;
       message.grasp = object.grasps.at(pose.candidate);
       message.centroid = to_message(Eigen::Vector3d(
