@@ -39,6 +39,7 @@ struct PartGrasps {
   std::vector<AntipodalGrasp> grasps;
   Eigen::Matrix3Xf points;   // m, spread evenly over the surface
   Eigen::Matrix3Xf normals;  // outward, unit
+  double area = 0.0;         // m^2, of the whole surface
   double mass = 0.0;         // kg
 };
 

@@ -26,6 +26,7 @@ struct GraspPose {
   double quality = 0.0;
   double tip_height = 0.0;             // m, finger tips over base_link's z = 0 once closed
   double engagement = 0.0;             // m, overlap of finger and object along the approach
+  int candidate = 0;                   // which of best_grasp_pose()'s candidates this is
   bool feasible = false;
   std::string reason;                  // one line, when not feasible
 };
