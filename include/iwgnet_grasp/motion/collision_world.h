@@ -1,6 +1,10 @@
 // What the arm must not touch, and the check of a configuration against it.
+//
+// The arm, the gripper and a held part are covered by spheres; the cell is made of boxes, the parts
+// on the table of columns of height. A check costs about a microsecond.
 #pragma once
 
+#include <array>
 #include <optional>
 #include <string>
 #include <vector>
@@ -10,7 +14,7 @@
 
 namespace iwgnet_grasp::motion {
 
-// Part in the gripper, as a capsule in the TCP frame.
+// Part in the gripper, as a capsule in the TCP frame of the present gap.
 struct AttachedPart {
   Eigen::Vector3d a, b;  // m
   double radius;         // m
@@ -18,27 +22,73 @@ struct AttachedPart {
 
 class CollisionWorld {
  public:
+  // The arm's bodies in chain order; kHeldPart only while a part is attached.
+  enum Body { kBase, kShoulder, kUpperArm, kForearm, kWrist1, kWrist2, kWrist3, kGripper, kFingers,
+              kHeldPart };
+
+  struct Sphere {
+    Body body;
+    Eigen::Vector3d center;  // m
+    double radius;           // m
+  };
+
   explicit CollisionWorld(const CellConfig& cell);
 
-  // Heights of the parts on the table; an empty map removes them.
+  // Heights of the parts on the table; an empty map removes them. Peaks narrower than three cells
+  // are taken for noise.
   void set_heights(const grasping::HeightMap& heights);
+  // Places the fingers. Default: wide open.
   void set_gripper_gap(double gap);
   void set_attached(const std::optional<AttachedPart>& part);
+  // Within this column (radius 3 mm about x, y of base_link) a gripper that points down moves
+  // straight onto or off a part: there its fingers and the held part are not checked against the
+  // heights, which the grasp pose has cleared already, nor the held part against anything.
+  void set_grasp_column(const std::optional<Eigen::Vector2d>& column);
 
   bool collides(const JointVector& q) const;
   // Names of what touches what, e.g. "wrist_3_link - camera"; empty when free.
   std::string describe(const JointVector& q) const;
+  // The spheres at q in base_link.
+  std::vector<Sphere> spheres(const JointVector& q) const;
 
  private:
-  struct Sphere;
-  CellConfig cell_;
-  std::vector<Box> boxes_;
-  std::vector<std::string> box_names_;
-  grasping::HeightMap heights_;
-  double gap_ = 0.085;
-  std::optional<AttachedPart> attached_;
+  static constexpr int kCapacity = 96;  // spheres
+
+  struct LocalSphere {
+    Body body;
+    int frame;               // 0 base_link, 1..6 DH frame of that joint
+    Eigen::Vector3d center;  // in the frame
+    double radius;
+  };
+  struct Placed {  // structure of arrays for the inner loops
+    alignas(64) std::array<double, kCapacity> x, y, z, r;
+  };
+  struct Obstacle {
+    std::string name;
+    Eigen::Vector3d center, half;
+  };
+  struct Heights {  // with the highest value of each block of cells above it
+    int columns = 0, rows = 0, block_columns = 0, block_rows = 0;
+    double resolution = 0.0, max = 0.0;
+    Eigen::Vector2d origin{0, 0};
+    std::vector<float> cells, blocks;
+  };
+
+  void rebuild();
+  bool in_grasp_column(const JointVector& q) const;
+  void place(const JointVector& q, Placed& placed) const;
+  bool touches_heights(double x, double y, double z, double radius) const;
+  // Calls report(name, name) for contacts until it returns true; returns whether it did.
   template <typename Report>
   bool check(const JointVector& q, Report&& report) const;
+
+  std::vector<Obstacle> obstacles_;
+  Heights heights_;
+  double gap_;
+  std::optional<AttachedPart> attached_;
+  std::optional<Eigen::Vector2d> column_;
+  std::vector<LocalSphere> spheres_;  // in the order of Body
+  std::array<int, kHeldPart + 2> first_{};  // index of the first sphere of each body, and the end
 };
 
 }  // namespace iwgnet_grasp::motion
