@@ -1,0 +1,121 @@
+"""`scripts/iwgnet`: the command line of the learning side."""
+
+import logging
+import warnings
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from iwgnet_grasp.networks import GRASP_NETWORKS
+
+app = typer.Typer(
+    name="iwgnet",
+    help="Data, training and evaluation of the grasp networks and of the detector.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+train_app = typer.Typer(
+    help="Train a grasp network on a folder of grasp data, or the [b]detector[/b].\n\n"
+    "Example: iwgnet train --network iwgnet --data data/train --epochs 30",
+    invoke_without_command=True,
+    rich_markup_mode="rich",
+)
+app.add_typer(train_app, name="train")
+
+NetworkName = StrEnum("NetworkName", {name: name for name in GRASP_NETWORKS})
+Split = StrEnum("Split", {"object": "object", "image": "image"})
+
+
+@train_app.callback()
+def train(
+    context: typer.Context,
+    network: Annotated[NetworkName, typer.Option(help="Which network.")] = NetworkName["iwgnet"],
+    data: Annotated[Path, typer.Option(help="Folder in Jacquard's or Cornell's layout.")] = Path(
+        "data/train"
+    ),
+    validation_data: Annotated[
+        Path | None, typer.Option(help="Folder to validate on; by default a share of --data.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the weights and their card.")] = Path(
+        "models"
+    ),
+    log_dir: Annotated[Path, typer.Option(help="TensorBoard logs and checkpoints.")] = Path(
+        "results/training"
+    ),
+    epochs: Annotated[int, typer.Option(min=1)] = 30,
+    batch: Annotated[int, typer.Option(min=1, help="Images a step and device.")] = 16,
+    learning_rate: Annotated[float, typer.Option(min=1e-7)] = 2e-3,
+    split: Annotated[
+        Split, typer.Option(help="Hold out whole objects (or scenes), or single images.")
+    ] = Split["object"],
+    limit: Annotated[int, typer.Option(min=0, help="Use the first N samples; 0: all.")] = 0,
+    patience: Annotated[
+        int, typer.Option(min=0, help="Stop after N epochs without a better top-1; 0: never.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Of weights, order, augmentation and split.")] = 0,
+    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = False,
+    accelerator: Annotated[str, typer.Option(help="auto, cpu or gpu.")] = "auto",
+    devices: Annotated[int, typer.Option(min=1, help="GPUs (or CPU processes) a node.")] = 1,
+    nodes: Annotated[int, typer.Option(min=1, help="Machines.")] = 1,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that prepare images.")] = 1,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads of torch; 0: all.")] = 0,
+) -> None:
+    """Train a grasp network; writes OUT/NETWORK.safetensors and OUT/NETWORK.json.
+
+    Watch it with: tensorboard --logdir results/training
+    """
+    if context.invoked_subcommand:
+        return
+    from iwgnet_grasp.training.grasp_training import (
+        GraspTrainingSettings,
+        TrainingResources,
+        train_grasp_network,
+    )
+
+    settings = GraspTrainingSettings(
+        network=network.value,
+        epochs=epochs,
+        batch=batch,
+        learning_rate=learning_rate,
+        split=split.value,
+        patience=patience,
+        seed=seed,
+    )
+    typer.echo(f"seed {seed}, network {network.value}, data {data}")
+    weights = train_grasp_network(
+        settings,
+        data,
+        out,
+        log_dir,
+        validation_data=validation_data,
+        resume=resume,
+        limit=limit,
+        resources=TrainingResources(accelerator, devices, nodes, workers, threads),
+    )
+    typer.echo(f"wrote {weights} and {weights.with_suffix('.json')}")
+
+
+def main() -> None:
+    """Entry point: errors that a user can mend end in one line, not in a traceback."""
+    from iwgnet_grasp.data.errors import DataError
+    from iwgnet_grasp.networks.weights import WeightsError
+
+    logging.basicConfig(format="%(levelname)s %(message)s")
+    for chatty in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="lightning")
+    try:
+        app()
+    except (DataError, WeightsError, ValueError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise SystemExit(2) from None
+    except OSError as error:
+        typer.echo(f"error: {error.filename or 'file'}: {error.strerror or error}", err=True)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()

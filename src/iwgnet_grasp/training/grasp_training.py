@@ -1,0 +1,286 @@
+"""Training of a grasp network: data folder in, weights and card out."""
+
+import json
+import logging
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.data import DataLoader
+
+from iwgnet_grasp.data.augmentation import Augmentation
+from iwgnet_grasp.data.depth import HEIGHT_CLIP, HEIGHT_UNIT
+from iwgnet_grasp.data.errors import DataError
+from iwgnet_grasp.data.grasp_dataset import VIEW_PX, GraspDataset, find_samples, load_views
+from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
+from iwgnet_grasp.networks import count_parameters, create_network
+from iwgnet_grasp.networks.decode import decode_grasps
+from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
+from iwgnet_grasp.networks.weights import load_weights, save_weights
+from iwgnet_grasp.training.losses import grasp_loss
+from iwgnet_grasp.training.rectangle_metric import any_match
+
+log = logging.getLogger(__name__)
+
+SPLITS = {"object": object_wise_split, "image": image_wise_split}
+
+
+@dataclass(frozen=True)
+class GraspTrainingSettings:
+    """Everything that decides the result, stored in the card."""
+
+    network: str = "iwgnet"
+    epochs: int = 30
+    batch: int = 16
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-4
+    warm_up: float = 0.05  # share of the steps
+    input_px: int = 224
+    validation: float = 0.1  # share held out of the data when there is no validation folder
+    split: str = "object"
+    patience: int = 0  # epochs without a better top-1 until training stops; 0: never
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class TrainingResources:
+    """What decides the speed only."""
+
+    accelerator: str = "auto"
+    devices: int = 1
+    nodes: int = 1
+    workers: int = 1
+    threads: int = 0  # of torch on the CPU; 0: torch's choice
+
+
+class GraspTraining(lightning.LightningModule):
+    """AdamW with a one-cycle schedule on `grasp_loss`, validated by the top-1 rectangle metric."""
+
+    def __init__(self, settings: GraspTrainingSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        network = create_network(settings.network)
+        self.network = network.to(memory_format=torch.channels_last)
+
+    def training_step(self, batch: tuple[torch.Tensor, torch.Tensor], _: int) -> torch.Tensor:
+        loss = self._loss(batch)
+        self.log_dict(
+            {f"train/{k}": v for k, v in loss._asdict().items()}, batch_size=len(batch[0])
+        )
+        return loss.total
+
+    def validation_step(self, batch: tuple[torch.Tensor, torch.Tensor], index: int) -> None:
+        loss = self._loss(batch)
+        dataset = self.trainer.val_dataloaders.dataset
+        maps = self.network(batch[0].to(memory_format=torch.channels_last))
+        predictions = torch.stack(list(maps), dim=1).float().cpu().numpy()
+        # The loader neither shuffles nor drops: item i of the batch is item start + i of the set,
+        # on several devices every world_size-th one.
+        world, rank = self.trainer.world_size, self.trainer.global_rank
+        start = index * self.settings.batch
+        hits = []
+        for i, prediction in enumerate(predictions):
+            item = min((start + i) * world + rank, len(dataset) - 1)
+            grasps = decode_grasps(*prediction, max_grasps=1)
+            hits.append(any_match(grasps, dataset.crop(item)[1]))
+        scores = {"val/loss": loss.total, "val/quality": loss.quality, "val/angle": loss.angle}
+        scores |= {"val/width": loss.width, "val/top1": torch.tensor(float(np.mean(hits)))}
+        self.log_dict(scores, batch_size=len(batch[0]), sync_dist=True, prog_bar=True)
+
+    def _loss(self, batch: tuple[torch.Tensor, torch.Tensor]):
+        heights, labels = batch
+        return grasp_loss(
+            self.network.logits(heights.to(memory_format=torch.channels_last)), labels
+        )
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        settings = self.settings
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        rest = [p for p in self.network.parameters() if p.ndim <= 1]
+        optimizer = torch.optim.AdamW(
+            [{"params": decayed}, {"params": rest, "weight_decay": 0.0}],
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer,
+            settings.learning_rate,
+            total_steps=max(int(self.trainer.estimated_stepping_batches), 2),
+            pct_start=settings.warm_up,
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class _Epoch(Callback):
+    """Tells the data set the epoch, also after a resume, so that the augmentation moves on."""
+
+    def __init__(self, dataset: GraspDataset) -> None:
+        self.dataset = dataset
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, module: GraspTraining) -> None:
+        self.dataset.epoch = trainer.current_epoch
+
+
+class _Weights(Callback):
+    """Writes weights and card whenever the validation has got better."""
+
+    def __init__(self, path: Path, card: dict[str, Any]) -> None:
+        self.path, self.card = path, card
+        self.best = (-1.0, -np.inf)
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: GraspTraining) -> None:
+        if trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        metrics = {k: float(v) for k, v in trainer.callback_metrics.items()}
+        score = (metrics["val/top1"], -metrics["val/loss"])
+        if score <= self.best:
+            return
+        self.best = score
+        validation = {k[4:]: round(v, 5) for k, v in metrics.items() if k.startswith("val/")}
+        card = self.card | {
+            "epoch": trainer.current_epoch + 1,
+            "steps": trainer.global_step,
+            "validation": validation,
+        }
+        save_weights(module.network, self.path, card)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": list(self.best)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.best = tuple(state["best"])
+
+
+def train_grasp_network(
+    settings: GraspTrainingSettings,
+    data: Path,
+    out: Path,
+    log_dir: Path,
+    validation_data: Path | None = None,
+    resume: bool = False,
+    limit: int = 0,
+    resources: TrainingResources | None = None,
+    progress: bool = True,
+) -> Path:
+    """Trains, writes OUT/NETWORK.safetensors and its card, returns the path.
+
+    DataError names data that cannot be used; ValueError an unknown network or setting. `resume`
+    goes on from LOG_DIR/NETWORK/last.ckpt; a run that was killed ends as if it had not been.
+    """
+    resources = resources or TrainingResources()
+    if settings.split not in SPLITS:
+        raise ValueError(f"no split '{settings.split}'; known: {', '.join(SPLITS)}")
+    create_network(settings.network)
+    if resources.threads:
+        torch.set_num_threads(resources.threads)
+    lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    samples = find_samples(data)
+    if limit:
+        samples = samples[:limit]
+    if validation_data:
+        training, held_out = samples, find_samples(validation_data)
+    else:
+        split = SPLITS[settings.split]
+        training, held_out = split(samples, settings.validation, settings.seed)
+    if not training or not held_out:
+        raise DataError(f"{data}: {len(samples)} samples are too few to train and to validate on")
+    train_set = GraspDataset(
+        load_views(training), settings.input_px, Augmentation(), seed=settings.seed
+    )
+    validation_set = GraspDataset(load_views(held_out), settings.input_px)
+    batch = min(settings.batch, len(train_set))
+    train_loader = DataLoader(
+        train_set,
+        batch,
+        shuffle=True,
+        drop_last=True,
+        num_workers=resources.workers,
+        generator=torch.Generator().manual_seed(settings.seed),
+    )
+    validation_loader = DataLoader(validation_set, settings.batch)
+
+    folder = log_dir / settings.network
+    module = GraspTraining(settings)
+    weights = out / f"{settings.network}.safetensors"
+    card = _card(settings, module, data, len(train_set), validation_data, len(validation_set))
+    checkpoint = ModelCheckpoint(
+        dirpath=folder, filename="best", monitor="val/top1", mode="max", save_last=True
+    )
+    callbacks = [_Epoch(train_set), _Weights(weights, card), checkpoint]
+    if settings.patience:
+        callbacks.append(EarlyStopping("val/top1", mode="max", patience=settings.patience))
+    if progress:
+        callbacks.append(RichProgressBar(leave=True))
+    cuda = resources.accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
+    bfloat16 = cuda or torch.cpu._is_avx512_bf16_supported()
+    trainer = lightning.Trainer(
+        accelerator=resources.accelerator if cuda else "cpu",
+        devices=resources.devices,
+        num_nodes=resources.nodes,
+        precision="bf16-mixed" if bfloat16 else "32-true",
+        max_epochs=settings.epochs,
+        logger=TensorBoardLogger(folder, name="", version=""),
+        callbacks=callbacks,
+        enable_progress_bar=progress,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+    )
+    last = folder / "last.ckpt"
+    if resume and not last.is_file():
+        raise DataError(f"{last}: no checkpoint to resume from; train without --resume")
+    trainer.fit(
+        module,
+        train_loader,
+        validation_loader,
+        ckpt_path=last if resume else None,
+        weights_only=True,
+    )
+    load_weights(weights)  # what was written can be read
+    return weights
+
+
+def _card(
+    settings: GraspTrainingSettings,
+    module: GraspTraining,
+    data: Path,
+    training_count: int,
+    validation_data: Path | None,
+    validation_count: int,
+) -> dict[str, Any]:
+    return {
+        "network": settings.network,
+        "parameters": count_parameters(module.network),
+        "input_px": settings.input_px,
+        "input": {
+            "quantity": "height above the table plane, holes filled",
+            "unit_m": HEIGHT_UNIT,
+            "clip": list(HEIGHT_CLIP),
+            "view_px": VIEW_PX,
+        },
+        "width_reference_px": WIDTH_REFERENCE_PX,
+        "data": {
+            "folder": data.name,
+            "samples": training_count,
+            "generator": _generator(data),
+            "validation_folder": validation_data.name if validation_data else None,
+            "validation_samples": validation_count,
+        },
+        "training": asdict(settings),
+        "torch": torch.__version__,
+    }
+
+
+def _generator(data: Path) -> dict[str, Any] | None:
+    """dataset.json of a generated set: seed, scenes and settings."""
+    path = data / "dataset.json"
+    try:
+        return json.loads(path.read_text()) if path.is_file() else None
+    except ValueError:
+        log.warning("%s: not JSON, left out of the card", path)
+        return None

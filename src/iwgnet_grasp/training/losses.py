@@ -1,0 +1,39 @@
+"""Loss of the grasp networks."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+class GraspLoss(NamedTuple):
+    total: Tensor
+    quality: Tensor
+    angle: Tensor
+    width: Tensor
+
+
+def grasp_loss(
+    logits: Tensor, labels: Tensor, angle_weight: float = 1.0, width_weight: float = 2.0
+) -> GraspLoss:
+    """Quality focal loss on Q, smooth L1 on cos, sin and width where a grasp is.
+
+    logits: [N, 4, H, W] of GraspNetwork.logits. labels: [N, 5, H, W] (q, cos, sin, width, mask).
+    Q: |y - p|^2 * cross entropy with the soft target y (Li et al., 2020), summed over all pixels
+    and divided by the number of grasp pixels, so that the empty table does not drown the object.
+    The background has neither angle nor width.
+    """
+    target, mask = labels[:, 0], labels[:, 4:5]
+    positives = mask.sum().clamp(min=1)
+    logit = logits[:, 0].float()
+    entropy = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
+    focus = (target - torch.sigmoid(logit)).square()
+    quality = (focus * entropy).sum() / positives
+    # The masked maps are zero on both sides where no grasp is.
+    double_angle = logits[:, 1:3].float() * mask
+    angle = F.smooth_l1_loss(double_angle, labels[:, 1:3], reduction="sum", beta=0.1) / positives
+    opening = logits[:, 3:].float() * mask
+    width = F.smooth_l1_loss(opening, labels[:, 3:4], reduction="sum", beta=0.05) / positives
+    total = quality + angle_weight * angle + width_weight * width
+    return GraspLoss(total, quality, angle, width)
