@@ -13,11 +13,9 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from iwgnet_grasp.data.errors import DataError
+
 BORDER = 114  # grey around a letterboxed image
-
-
-class DetectionDataError(ValueError):
-    """A detection data set that cannot be used: one line with the file and what is wrong."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class DetectionSet:
         """Scenes to train on and the last `fraction` of them, at least one, to test with."""
         held_out = max(1, round(len(self.scenes) * fraction))
         if held_out >= len(self.scenes):
-            raise DetectionDataError(
+            raise DataError(
                 f"{len(self.scenes)} scenes cannot be split into training and test; make more"
             )
         return (
@@ -90,7 +88,7 @@ def load_detection_set(
 
     folder: a data set made by 'iwgnet generate' (or its detector folder). limit: at most that many
     scenes. Boxes of COCO [x, y, width, height]; crowd regions are left out. Classes are ordered by
-    category id. Raises DetectionDataError.
+    category id. Raises DataError.
     """
     root = Path(folder)
     root = root / "detector" if (root / "detector").is_dir() else root
@@ -109,20 +107,20 @@ def load_detection_set(
         images = sorted(text["images"], key=lambda i: i["file_name"])[:limit]
         files = [(i["id"], root / "images" / Path(i["file_name"]).name) for i in images]
     except FileNotFoundError:
-        raise DetectionDataError(
+        raise DataError(
             f"{path}: no such file; make data with 'iwgnet generate'"
         ) from None
     except (OSError, KeyError, TypeError, ValueError) as error:
         line = " ".join(str(error).split())
-        raise DetectionDataError(f"{path}: not COCO annotations ({line})") from None
+        raise DataError(f"{path}: not COCO annotations ({line})") from None
     if not files or not categories:
-        raise DetectionDataError(f"{path}: names no images or no categories")
+        raise DataError(f"{path}: names no images or no categories")
 
     def read(entry: tuple[int, Path]) -> DetectionScene:
         identifier, file = entry
         image = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if image is None:
-            raise DetectionDataError(f"{file}: missing or not an image")
+            raise DataError(f"{file}: missing or not an image")
         fitted, fit = letterbox(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), size)
         corners = np.array([b for b, _ in boxes[identifier]], np.float64).reshape(-1, 4)
         labels = np.array([label for _, label in boxes[identifier]], np.int64)

@@ -186,6 +186,7 @@ class Perception:
 def load_perception(path: str | Path = DEFAULT_CONFIG) -> Perception:
     """Perception with the weights that a config file names. Raises PerceptionError."""
     from iwgnet_grasp.networks.inference import GraspEstimator
+    from iwgnet_grasp.networks.weights import WeightsError
     from iwgnet_grasp.perception.detector import Detector
 
     config = PerceptionConfig.load(path)
@@ -196,7 +197,11 @@ def load_perception(path: str | Path = DEFAULT_CONFIG) -> Perception:
         max_objects=config.max_objects,
         backend=config.detector_backend,
     )
-    return Perception(config, detector, GraspEstimator(config.grasp_weights))
+    try:
+        estimator = GraspEstimator(config.grasp_weights)
+    except WeightsError as error:
+        raise PerceptionError(str(error)) from error
+    return Perception(config, detector, estimator)
 
 
 def checked_color(color: np.ndarray) -> np.ndarray:
