@@ -22,6 +22,9 @@ constexpr double kGravity = 9.81;        // m/s^2
 constexpr float kPatchDepth = 0.0005f;   // m, a soft pad yields this much: what lies within touches
 constexpr double kCellDistance = 0.003;  // m, candidates closer than this ...
 constexpr double kCellAngle = 0.13;      // rad, ... and than this are tried once
+constexpr float kRim = 0.002f;           // m around a pad: a part that bulges there meets its edge
+constexpr float kBulge = 0.0003f;        // m
+constexpr double kSlantShare = 0.5;      // of a face's slant that counts where an edge is gripped
 constexpr int kLineSamples = 15;         // pixels looked at along the closing line
 constexpr double kOwnShare = 0.3;        // least share of them that shows the part
 constexpr double kForeignShare = 0.15;   // most that may show another part
@@ -78,14 +81,17 @@ std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose) {
   thread_local std::vector<int> index;
   touched.clear();
   index.clear();
-  float low = std::numeric_limits<float>::max(), high = -low;
+  float low = std::numeric_limits<float>::max(), high = -low, rim_low = low, rim_high = high;
   for (Eigen::Index i = 0; i < part.points.cols(); ++i) {
     const Eigen::Vector3f p = part.points.col(i) - center;
-    if (p.z() < 0.0f || p.z() > static_cast<float>(kPadHeight)) continue;
+    if (p.z() < -kRim || p.z() > static_cast<float>(kPadHeight) + kRim) continue;
     const float t = p.dot(across);
-    if (std::abs(t) > half_width) continue;
+    if (std::abs(t) > half_width + kRim) continue;
     const float s = p.dot(along);
     if (std::abs(s) > half_opening) continue;
+    rim_low = std::min(rim_low, s);
+    rim_high = std::max(rim_high, s);
+    if (p.z() < 0.0f || p.z() > static_cast<float>(kPadHeight) || std::abs(t) > half_width) continue;
     touched.push_back({s, t, p.z()});
     index.push_back(static_cast<int>(i));
     low = std::min(low, s);
@@ -123,10 +129,15 @@ std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose) {
   const Eigen::Vector2f inner_low = patches[0].low.cwiseMax(patches[1].low);
   const Eigen::Vector2f inner_high = patches[0].high.cwiseMin(patches[1].high);
   const double offset = (inner_low - inner_high).cwiseMax(0.0f).norm();
-  const double normals = std::max(
-      std::acos(std::clamp(-patches[0].normal.normalized().dot(along), -1.0f, 1.0f)),
-      std::acos(std::clamp(patches[1].normal.normalized().dot(along), -1.0f, 1.0f)));
-  result.misfit = std::max(normals, std::atan2(offset, std::max(result.width, 1e-6)));
+  // A flat pad pushes along the closing direction even on a slanted face, whose outermost edge it
+  // meets: the slant then only shows as an offset between the two edges. Where the part bulges
+  // beside the pad, though, the pad's own edge meets the face and pushes along its normal.
+  const auto slant = [&](int side, bool bulges) {
+    const float cosine = (side ? 1 : -1) * patches[side].normal.normalized().dot(along);
+    return (bulges ? 1.0 : kSlantShare) * std::acos(std::clamp(cosine, -1.0f, 1.0f));
+  };
+  result.misfit = std::max({slant(0, rim_low < low - kBulge), slant(1, rim_high > high + kBulge),
+                            std::atan2(offset, std::max(result.width, 1e-6))});
   const Eigen::Vector2f middle = 0.5f * (inner_low + inner_high);
   const Eigen::Vector3f com = part.com.cast<float>() - center;
   result.com_across = std::abs(com.dot(across) - middle.x());

@@ -52,10 +52,11 @@ GraspAxes axes_at(const GraspRectangle& grasp, const PinholeIntrinsics& camera, 
 
 // Height of the object's surface along the closing line over the grasp's width.
 double surface_height(const HeightMap& heights, const GraspAxes& axes, double width) {
-  const double step = heights.resolution() / 2;
+  const double step = heights.resolution();
   const int n = std::max(1, static_cast<int>(width / 2 / step));
   const int m = std::max(1, static_cast<int>(kLineHalfWidth / step));
-  std::vector<double> samples;
+  thread_local std::vector<double> samples;
+  samples.clear();
   samples.reserve((2 * n + 1) * (2 * m + 1));
   for (int i = -n; i <= n; ++i)
     for (int j = -m; j <= m; ++j) {
@@ -66,47 +67,6 @@ double surface_height(const HeightMap& heights, const GraspAxes& axes, double wi
   std::nth_element(samples.begin(), rank, samples.end());
   return *rank;
 }
-
-// What lies beside the grasp's centre, as a finger meets it: the highest point over the pad's
-// width at each distance from the centre along the closing line, on either side.
-class SideProfile {
- public:
-  SideProfile(const HeightMap& heights, const GraspAxes& axes, double reach, double side_clearance)
-      : step_(heights.resolution()) {
-    const double half = kinematics::kPadWidth / 2 + side_clearance;
-    const int across = static_cast<int>(std::ceil(half / step_));
-    const int count = static_cast<int>(std::ceil(reach / step_)) + 1;
-    for (int side = 0; side < 2; ++side) {
-      heights_[side].resize(count);
-      for (int i = 0; i < count; ++i) {
-        const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step_);
-        double highest = 0.0;
-        for (int j = -across; j <= across; ++j) {
-          const Eigen::Vector2d q = p + axes.across * (half * j / across);
-          highest = std::max(highest, heights.at(q.x(), q.y()));
-        }
-        heights_[side][i] = highest;
-      }
-    }
-  }
-
-  // Highest point at distances [from, to] on a side.
-  double highest(int side, double from, double to) const {
-    const auto& h = heights_[side];
-    const int last = std::min<int>(h.size() - 1, std::ceil(to / step_));
-    double highest = 0.0;
-    for (int i = std::max(0, static_cast<int>(std::floor(from / step_))); i <= last; ++i)
-      highest = std::max(highest, h[i]);
-    return highest;
-  }
-  int count() const { return static_cast<int>(heights_[0].size()); }
-  double step() const { return step_; }
-  double at(int side, int i) const { return heights_[side][i]; }
-
- private:
-  double step_;
-  std::array<std::vector<double>, 2> heights_;
-};
 
 // The lowest point of a finger's outer side, above its tip, at a distance outwards from its face.
 double underside(const GraspPoseConfig& config, double outwards) {
@@ -121,18 +81,64 @@ double underside(const GraspPoseConfig& config, double outwards) {
   return std::numeric_limits<double>::infinity();
 }
 
-// Whether both fingers, tips at `tip` once the gap is `closed`, fit beside the object at `gap`.
-bool fits(const SideProfile& profile, int side, const GraspPoseConfig& config, double tip,
-          double closed, double gap) {
-  const double raised = tip + finger_tip_height(closed) - finger_tip_height(gap);
-  const int first = static_cast<int>(std::ceil(gap / 2 / profile.step() - 1e-9));
-  for (int i = first; i < profile.count(); ++i) {
-    const double lowest = underside(config, i * profile.step() - gap / 2);
-    if (!std::isfinite(lowest)) break;
-    if (profile.at(side, i) + config.floor_clearance > raised + lowest) return false;
-  }
-  return true;
+// Gaps are tried in steps of kStep; index i is the gap i * kStep.
+double tip_height_at(int gap) {
+  static const auto table = [] {
+    std::vector<double> heights;
+    for (int i = 0; i * kStep <= kinematics::max_gap() + kStep; ++i)
+      heights.push_back(finger_tip_height(i * kStep));
+    return heights;
+  }();
+  return table[gap];
 }
+
+// How high the tips must stand so that both fingers clear what lies beside the grasp's centre, at
+// every gap. A finger meets the highest point over the pad's width and some play.
+class Clearance {
+ public:
+  Clearance(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
+            int first_gap, int last_gap)
+      : first_(first_gap) {
+    const double step = heights.resolution();
+    const double half = kinematics::kPadWidth / 2 + config.side_clearance;
+    const double reach = config.finger_outline.empty() ? config.finger_thickness
+                                                       : config.finger_outline.back().x();
+    const int across = static_cast<int>(std::ceil(half / step));
+    const int begin = static_cast<int>(std::ceil(first_gap * kStep / 2 / step));
+    const int end = static_cast<int>(std::ceil((last_gap * kStep / 2 + reach) / step));
+    std::vector<double> profile(std::max(0, end - begin + 1));
+    for (int side = 0; side < 2; ++side) {
+      for (int i = begin; i <= end; ++i) {
+        const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step);
+        double highest = 0.0;
+        for (int j = -across; j <= across; ++j) {
+          const Eigen::Vector2d q = p + axes.across * (half * j / across);
+          highest = std::max(highest, heights.at(q.x(), q.y()));
+        }
+        profile[i - begin] = highest;
+      }
+      for (int gap = first_gap; gap <= last_gap; ++gap) {
+        const double face = gap * kStep / 2;
+        double lowest_tip = 0.0;
+        for (int i = static_cast<int>(std::ceil(face / step - 1e-9)); i <= end; ++i) {
+          const double rise = underside(config, i * step - face);
+          if (!std::isfinite(rise)) break;
+          lowest_tip = std::max(lowest_tip, profile[i - begin] - rise);
+        }
+        tips_[side].push_back(lowest_tip + config.floor_clearance);
+      }
+    }
+  }
+
+  // Whether a finger stands free at `gap` when its tip comes to `tip` once the gap is `closed`.
+  bool free(int side, double tip, int closed, int gap) const {
+    return tips_[side][gap - first_] <= tip + tip_height_at(closed) - tip_height_at(gap) + 1e-9;
+  }
+
+ private:
+  int first_;
+  std::array<std::vector<double>, 2> tips_;
+};
 
 std::string millimetres(double metres) {
   char text[32];
@@ -146,29 +152,28 @@ struct Descent {
 };
 
 // Deepest position of the tips at which both fingers find room.
-Descent descend(const SideProfile& profile, const GraspPoseConfig& config, double surface,
-                double width) {
+Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
+                double surface, double width) {
+  const auto steps = [](double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); };
+  const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
+  const int margin = steps(config.opening_margin);
+  const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
+  const Clearance clearance(heights, axes, config, first, widest);
   for (double engaged = config.insertion_depth; engaged >= config.min_engagement - 1e-9;
        engaged -= kStep) {
     const double tip = surface - engaged;
     if (tip < config.floor_clearance) continue;
-    // Contact: on each side the nearest place to the centre where the finger stands free.
-    double contact = 0.0;
-    for (int side = 0; side < 2 && contact <= config.max_opening; ++side) {
-      double gap = std::max(kCoreShare * width, contact);
-      while (gap <= config.max_opening && !fits(profile, side, config, tip, gap, gap)) gap += 2 * kStep;
-      contact = gap;
-    }
-    // The other side has moved on: both must be free at the common gap and all the way out.
-    const double least = contact + 2 * config.side_clearance;
-    double opening = 0.0;
-    for (double gap = contact; gap <= std::min(config.max_opening, contact + config.opening_margin) + 1e-9;
-         gap += kStep) {
-      if (!fits(profile, 0, config, tip, contact, gap) || !fits(profile, 1, config, tip, contact, gap))
-        break;
-      opening = gap;
-    }
-    if (opening >= least - 1e-9) return {true, tip, contact, opening};
+    // Contact: the nearest place to the centre where both fingers stand free.
+    int contact = first;
+    while (contact <= widest && !(clearance.free(0, tip, contact, contact) &&
+                                  clearance.free(1, tip, contact, contact)))
+      ++contact;
+    int opening = contact;
+    while (opening + 1 <= std::min(widest, contact + margin) &&
+           clearance.free(0, tip, contact, opening + 1) && clearance.free(1, tip, contact, opening + 1))
+      ++opening;
+    if (contact <= widest && opening >= contact + play)
+      return {true, tip, contact * kStep, opening * kStep};
   }
   return {};
 }
@@ -262,9 +267,7 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
                       millimetres(surface) + " above the table");
 
   // Stage 3: depth and opening.
-  const double reach = config.max_opening / 2 + config.finger_outline.back().x();
-  const SideProfile profile(heights, axes, reach, config.side_clearance);
-  const Descent descent = descend(profile, config, surface, pose.width);
+  const Descent descent = descend(heights, axes, config, surface, pose.width);
   if (!descent.found) return infeasible("fingers find no room beside the object");
   const double yaw = std::atan2(axes.along.y(), axes.along.x());
   const double open_tip =

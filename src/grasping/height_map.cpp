@@ -82,21 +82,25 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
   grid_.setTo(kUnknown);
 
   const cv::Rect seen = pixels_of(low, high, camera, T_base_camera.inverse());
-  const Eigen::Matrix3f R = T_base_camera.rotation().cast<float>();
-  const Eigen::Vector3f t = T_base_camera.translation().cast<float>();
-  const float x0 = low.x(), y0 = low.y(), scale = 1.0 / resolution;
+  // In units of cells across the grid, metres upwards.
+  const float scale = 1.0 / resolution;
+  const Eigen::Matrix3f R =
+      Eigen::Vector3f(scale, scale, 1.0f).asDiagonal() * T_base_camera.rotation().cast<float>();
+  const float tx = (T_base_camera.translation().x() - low.x()) * scale;
+  const float ty = (T_base_camera.translation().y() - low.y()) * scale;
+  const float tz = T_base_camera.translation().z();
+  const float ax = R(0, 0) / camera.fx, ay = R(1, 0) / camera.fx, az = R(2, 0) / camera.fx;
   for (int v = seen.y; v < seen.y + seen.height; ++v) {
     const float* row = depth.ptr<float>(v);
-    const Eigen::Vector3f base = R.col(2) + R.col(1) * ((v - camera.cy) / camera.fy);
+    const Eigen::Vector3f ray = R.col(2) + R.col(1) * static_cast<float>((v - camera.cy) / camera.fy) -
+                                R.col(0) * static_cast<float>(camera.cx / camera.fx);
     for (int u = seen.x; u < seen.x + seen.width; ++u) {
       const float z = row[u];
       if (!(z > 0.0f)) continue;
-      const Eigen::Vector3f p =
-          (base + R.col(0) * static_cast<float>((u - camera.cx) / camera.fx)) * z + t;
-      const float column = (p.x() - x0) * scale, line = (p.y() - y0) * scale;
+      const float column = (ray.x() + ax * u) * z + tx, line = (ray.y() + ay * u) * z + ty;
       if (!(column >= 0.0f && line >= 0.0f && column < columns && line < rows)) continue;
       float& cell_height = grid_.ptr<float>(static_cast<int>(line))[static_cast<int>(column)];
-      cell_height = std::max(cell_height, p.z());
+      cell_height = std::max(cell_height, (ray.z() + az * u) * z + tz);
     }
   }
   fill_unknown(grid_);
