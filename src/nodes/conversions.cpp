@@ -82,6 +82,8 @@ GraspPose to_message(const grasping::GraspPose& pose) {
   message.pose = to_message(pose.T_base_tcp);
   message.width = pose.width;
   message.opening = pose.opening;
+  message.tip_height = pose.tip_height;
+  message.engagement = pose.engagement;
   message.quality = static_cast<float>(pose.quality);
   message.feasible = pose.feasible;
   message.reason = pose.reason;
@@ -93,6 +95,8 @@ grasping::GraspPose from_message(const GraspPose& message) {
   pose.T_base_tcp = from_message(message.pose);
   pose.width = message.width;
   pose.opening = message.opening;
+  pose.tip_height = message.tip_height;
+  pose.engagement = message.engagement;
   pose.quality = message.quality;
   pose.feasible = message.feasible;
   pose.reason = message.reason;

@@ -114,7 +114,7 @@ class MotionControl {
  public:
   MotionControl()
       : cell_(load_cell_config(config_dir())),
-        config_(motion::load_pick_place_config(config_dir())),
+        config_(load_config()),
         pick_and_place_(cell_, config_),
         robot_(config_.held_gap_min),
         transforms_(buffer_),
@@ -127,6 +127,12 @@ class MotionControl {
   }
 
  private:
+  static motion::PickPlaceConfig load_config() {
+    motion::PickPlaceConfig config = motion::load_pick_place_config(config_dir());
+    config.planner.seed = ros::param::param("~planner_seed", static_cast<int>(config.planner.seed));
+    return config;
+  }
+
   void on_scene(const Scene::ConstPtr& scene) {
     const std::lock_guard lock(mutex_);
     scene_ = scene;

@@ -1,0 +1,1 @@
+"""What needs rospy: messages <-> values, and the session that runs the graph."""

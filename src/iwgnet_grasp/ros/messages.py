@@ -1,0 +1,139 @@
+"""Messages of the package <-> the values of perception and priority."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from iwgnet_grasp import msg
+from iwgnet_grasp.perception.types import (
+    Box,
+    CameraIntrinsics,
+    GraspRectangle,
+    ObjectGrasps,
+    PerceptionError,
+)
+from iwgnet_grasp.priority import RankedObject
+
+_IMAGE_TYPES = {  # encoding: (numpy type, channels)
+    "rgb8": (np.uint8, 3),
+    "16UC1": (np.uint16, 1),
+    "32FC1": (np.float32, 1),
+}
+
+
+def image_array(image, name: str) -> np.ndarray:
+    """sensor_msgs/Image -> (H, W, 3) uint8 or (H, W) uint16 / float32, without a copy.
+
+    Raises PerceptionError for other encodings and for images whose data do not fit their size.
+    """
+    if image.encoding not in _IMAGE_TYPES:
+        raise PerceptionError(
+            f"{name}: encoding '{image.encoding}' is not one of {', '.join(_IMAGE_TYPES)}"
+        )
+    dtype, channels = _IMAGE_TYPES[image.encoding]
+    row = image.width * channels * np.dtype(dtype).itemsize
+    if (
+        image.width == 0
+        or image.height == 0
+        or image.step < row
+        or (len(image.data) != image.step * image.height)
+    ):
+        raise PerceptionError(
+            f"{name}: an image of {image.width}x{image.height} px {image.encoding} cannot have "
+            f"{len(image.data)} bytes"
+        )
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    pixels = np.ascontiguousarray(rows[:, :row]).view(dtype)
+    if image.is_bigendian and np.dtype(dtype).itemsize > 1:
+        pixels = pixels.byteswap()
+    shape = (image.height, image.width) + ((channels,) if channels > 1 else ())
+    return pixels.reshape(shape)
+
+
+def camera_intrinsics(info) -> CameraIntrinsics:
+    """Raises PerceptionError for a camera that is not calibrated."""
+    if not (info.K[0] > 0 and info.K[4] > 0):
+        raise PerceptionError("camera info: no positive focal length; is the camera calibrated?")
+    return CameraIntrinsics(fx=info.K[0], fy=info.K[4], cx=info.K[2], cy=info.K[5])
+
+
+def grasp_to_message(grasp: GraspRectangle) -> msg.GraspRectangle:
+    return msg.GraspRectangle(
+        x_px=grasp.x_px,
+        y_px=grasp.y_px,
+        theta_rad=grasp.theta_rad,
+        width_px=grasp.width_px,
+        quality=grasp.quality,
+        depth_m=grasp.depth_m,
+    )
+
+
+def grasp_from_message(message: msg.GraspRectangle) -> GraspRectangle:
+    return GraspRectangle(
+        x_px=message.x_px,
+        y_px=message.y_px,
+        theta_rad=message.theta_rad,
+        width_px=message.width_px,
+        quality=message.quality,
+        depth_m=message.depth_m,
+    )
+
+
+def failed_to_message(failed: Iterable[GraspRectangle], header) -> msg.FailedGrasps:
+    return msg.FailedGrasps(header=header, grasps=[grasp_to_message(g) for g in failed])
+
+
+def object_to_message(value: ObjectGrasps) -> msg.ObjectGrasps:
+    message = msg.ObjectGrasps(
+        object_id=value.object_id,
+        label=value.label,
+        score=value.score,
+        centroid_u_px=value.centroid_u_px,
+        centroid_v_px=value.centroid_v_px,
+        centroid_depth_m=value.centroid_depth_m,
+        valid_pixels=value.valid_pixels,
+        grasps=[grasp_to_message(g) for g in value.grasps],
+    )
+    box = message.box
+    box.x_offset, box.y_offset = value.box.x, value.box.y
+    box.width, box.height = value.box.width, value.box.height
+    return message
+
+
+def object_from_message(message: msg.ObjectGrasps) -> ObjectGrasps:
+    box = message.box
+    return ObjectGrasps(
+        object_id=message.object_id,
+        label=message.label,
+        score=message.score,
+        box=Box(box.x_offset, box.y_offset, box.width, box.height),
+        centroid_u_px=message.centroid_u_px,
+        centroid_v_px=message.centroid_v_px,
+        centroid_depth_m=message.centroid_depth_m,
+        valid_pixels=message.valid_pixels,
+        grasps=tuple(grasp_from_message(g) for g in message.grasps),
+    )
+
+
+def ranked_to_message(value: RankedObject) -> msg.RankedObject:
+    return msg.RankedObject(
+        object=object_to_message(value.object),
+        depth_distance_m=value.depth_distance_m,
+        centroid_distance_m=value.centroid_distance_m,
+        score=value.score,
+        priority=value.priority,
+        reason=value.reason,
+    )
+
+
+def ranked_from_message(message: msg.RankedObject) -> RankedObject:
+    return RankedObject(
+        object=object_from_message(message.object),
+        depth_distance_m=message.depth_distance_m,
+        centroid_distance_m=message.centroid_distance_m,
+        score=message.score,
+        priority=message.priority,
+        reason=message.reason,
+    )
