@@ -1,0 +1,1 @@
+"""Figures of the whole project, each beside its goal and, with --peers, beside a peer's."""

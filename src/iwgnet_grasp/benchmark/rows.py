@@ -1,0 +1,220 @@
+"""The rows of the benchmark: what is measured, its goal and its peer."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from iwgnet_grasp.benchmark.measure import (
+    PACKAGE,
+    BenchmarkError,
+    command,
+    core,
+    last_line,
+    median_seconds,
+    module,
+    peer,
+)
+
+
+@dataclass(frozen=True)
+class Goal:
+    limit: float
+    at_least: bool = False  # else: at most
+
+    def text(self, unit: str) -> str:
+        return f"{'>=' if self.at_least else '<='} {self.limit:g} {unit}"
+
+    def met(self, value: float) -> bool:
+        return value >= self.limit if self.at_least else value <= self.limit
+
+
+@dataclass(frozen=True)
+class Result:
+    name: str
+    value: float
+    unit: str
+    detail: str
+    goal: Goal | None = None
+    peer: str = ""
+    peer_value: float | None = None
+
+    @property
+    def met(self) -> bool | None:
+        return self.goal.met(self.value) if self.goal else None
+
+    def as_dict(self) -> dict:
+        ratio = self.value / self.peer_value if self.peer_value else None
+        return {**asdict(self), "met": self.met, "ratio": ratio}
+
+
+@dataclass(frozen=True)
+class Row:
+    name: str
+    what: str
+    measure: Callable[[bool], Result]
+
+
+def _core_row(name: str, goal: Goal | None, peer_script: str = "", peer_name: str = "") -> Row:
+    def measure(peers: bool) -> Result:
+        ours = core(name)[name]
+        peer_value = peer(peer_script)["value"] if peers and peer_script else None
+        value, unit, detail = ours["value"], ours["unit"], ours["detail"]
+        return Result(name, value, unit, detail, goal, peer_name, peer_value)
+
+    return Row(name, _WHAT[name], measure)
+
+
+_WHAT = {
+    "ik": "closed-form inverse kinematics, all solutions",
+    "physics": "physics against real time, one core",
+    "depth_frame": "a depth image as the D455 measures it",
+    "color_frame": "a colour image",
+    "scene": "a pile of ten, dropped and settled",
+    "planning": "a collision-free transfer",
+    "hand_eye": "hand-eye refinement of 15 pairs",
+}
+
+
+def _ik_kdl(peers: bool) -> Result:
+    rows = core("ik", "ik_kdl")
+    return Result(
+        "ik_kdl",
+        rows["ik_kdl"]["value"],
+        "us",
+        rows["ik_kdl"]["detail"],
+        peer="closed form",
+        peer_value=rows["ik"]["value"],
+    )
+
+
+def _iwgnet(peers: bool) -> Result:
+    import numpy as np
+
+    from iwgnet_grasp.networks.inference import GraspEstimator, torch_predictor
+    from iwgnet_grasp.networks.weights import load_weights
+
+    estimator = GraspEstimator("iwgnet")
+    size = estimator.input_px
+    window = np.random.default_rng(0).uniform(-0.1, 1, (1, size, size)).astype(np.float32)
+    ours = median_seconds(lambda: estimator._predict(window)) * 1e3
+    network, _ = load_weights("iwgnet")
+    plain = torch_predictor(network.eval(), bfloat16=False)
+    rival = median_seconds(lambda: plain(window)) * 1e3
+    detail = f"{size}x{size}, {estimator.backend}"
+    return Result("iwgnet", ours, "ms", detail, None, "torch float32", rival)
+
+
+def _look(peers: bool) -> Result:
+    from iwgnet_grasp import _core
+    from iwgnet_grasp.perception import load_perception
+    from iwgnet_grasp.perception.types import CameraIntrinsics
+    from iwgnet_grasp.priority import PriorityConfig, rank
+
+    cell = _core.SimulatedCell(str(PACKAGE), "")
+    cell.load_scene("", 0)
+    empty = cell.aligned_depth(cell.depth())
+    cell.load_scene("ten_stacked", 0)
+    color, depth = cell.color(), cell.aligned_depth(cell.depth())
+    perception = load_perception()
+    k = cell.camera.color
+    intrinsics = CameraIntrinsics(k.fx, k.fy, k.cx, k.cy)
+    priority = PriorityConfig.load(PACKAGE / "config" / "priority.yaml")
+    objects: list = []
+
+    def look() -> None:
+        objects[:] = perception.look(color, depth, empty).objects
+        rank(objects, intrinsics, priority, [])
+
+    value = median_seconds(look, runs=10) * 1e3
+    detail = f"image to order, {len(objects)} of ten objects seen"
+    return Result("look", value, "ms", detail, Goal(150))
+
+
+def _trial(path: Path) -> dict:
+    try:
+        return json.loads((path / "trial.json").read_text())
+    except (OSError, ValueError) as error:
+        raise BenchmarkError(f"the trial left no readable result: {error}") from None
+
+
+def _trial_in_process(peers: bool) -> Result:
+    with tempfile.TemporaryDirectory() as folder:
+        run = module(
+            "iwgnet_grasp.trials.in_process",
+            "--scene", "ten_stacked", "--seed", "0", "--out", folder,
+            timeout_s=600,
+        )  # fmt: skip
+        if run.returncode not in (0, 1):
+            raise BenchmarkError(last_line(run.stderr))
+        trial = _trial(Path(folder))
+    return Result(
+        "trial_in_process",
+        trial["sim_time_s"] / trial["wall_time_s"],
+        "x real time",
+        f"ten_stacked, {trial['sim_time_s']:.0f} s simulated, all computing included",
+    )
+
+
+def _ros_trial(scene: str, seed: int) -> tuple[dict, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.monotonic()
+        run = command(
+            [
+                str(PACKAGE / "scripts" / "start_grasping"),
+                f"scene:={scene}",
+                f"seed:={seed}",
+                f"out:={folder}",
+            ],
+            timeout_s=900,
+        )
+        wall = time.monotonic() - start
+        if run.returncode not in (0, 1):
+            raise BenchmarkError(last_line(run.stderr) or last_line(run.stdout))
+        return _trial(Path(folder)), wall
+
+
+def _trial_ros(peers: bool) -> Result:
+    trial, wall = _ros_trial("five_scattered", 0)
+    factor = trial["sim_time_s"] / trial["wall_time_s"]
+    detail = f"five objects, start to end of scripts/start_grasping; {factor:.1f}x real time"
+    return Result("trial_ros", wall, "s", detail, Goal(180))
+
+
+def _trial_ros_speed(peers: bool) -> Result:
+    trial, _ = _ros_trial("five_scattered", 1)
+    factor = trial["sim_time_s"] / trial["wall_time_s"]
+    detail = f"five objects over ROS, {trial['sim_time_s']:.0f} s simulated"
+    return Result("trial_ros_speed", factor, "x real time", detail, Goal(1, at_least=True))
+
+
+def _success(peers: bool) -> Result:
+    wins = []
+    for seed in range(10):
+        trial, _ = _ros_trial("five_scattered", seed)
+        wins.append(trial["success"])
+    lost = [str(seed) for seed, won in enumerate(wins) if not won]
+    detail = "five_scattered over ROS, seeds 0-9" + (f"; failed: {', '.join(lost)}" if lost else "")
+    return Result("success", sum(wins), "of 10", detail, Goal(9, at_least=True))
+
+
+ROWS = (
+    _core_row("ik", Goal(3), "trac_ik", "TRAC-IK (one solution)"),
+    Row("ik_kdl", "inverse kinematics by KDL", _ik_kdl),
+    _core_row("physics", Goal(8, at_least=True), "pybullet_physics", "pybullet, 240 Hz"),
+    _core_row("depth_frame", Goal(25), "pybullet_depth", "pybullet TinyRenderer, no noise"),
+    _core_row("color_frame", None),
+    _core_row("scene", None),
+    _core_row("planning", None),
+    _core_row("hand_eye", Goal(6)),
+    Row("iwgnet", "IWGNet on one window, fastest backend", _iwgnet),
+    Row("look", "detection, IWGNet and order of a pile of ten", _look),
+    Row("trial_in_process", "a ten-object trial in one process", _trial_in_process),
+    Row("trial_ros", "the five-object trial in one command", _trial_ros),
+    Row("trial_ros_speed", "the five-object trial against real time", _trial_ros_speed),
+    Row("success", "five-object trials, seeds 0-9, by the judge", _success),
+)
