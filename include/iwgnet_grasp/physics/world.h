@@ -29,7 +29,8 @@ struct PartState {
   Eigen::Vector3d angular = Eigen::Vector3d::Zero();  // rad/s
 };
 
-// Who touches whom in the last step. Names: URDF links, "table", "tray", "camera", "part:INDEX".
+// Who touches whom in the last step. Names: URDF links, "table", "tray", "camera",
+// "camera_mount", "part:INDEX".
 struct Contact {
   std::string a, b;
   double normal_force;    // N, summed over the pair's contact points
@@ -51,9 +52,12 @@ class World {
 
   // Removes all parts, puts the arm at rest at q with the gripper open, time to 0.
   void reset(const JointVector& q);
-  // Index of the new part. Friction in (0, 1.5]; combined with the other body's by product.
+  // Index of the new part. Friction is physics.yaml's; a pair's coefficient is the product.
   int add_part(const PartModel& model, const Pose& T_base_part);
   void set_part_pose(int part, const Pose& T_base_part);  // at rest; for building scenes only
+  // Takes the robot out of the simulation, or puts it back as it was: scenes settle without it, and
+  // time() stands still meanwhile.
+  void simulate_robot(bool on);
 
   void step();  // one step of timestep()
   double timestep() const;
@@ -63,6 +67,8 @@ class World {
   void set_arm_setpoint(const JointVector& q, const JointVector& qd);
   void set_gripper_setpoint(double gap, double max_speed, double max_force);
 
+  double reachable_gap(double gap) const;  // nearest gap within the gripper's stroke, m
+
   ArmState arm() const;
   GripperState gripper() const;
   std::vector<LinkPose> link_poses() const;  // every URDF link, mimic joints included
@@ -71,7 +77,7 @@ class World {
   int part_count() const;
   PartState part(int index) const;
   std::vector<Contact> contacts() const;
-  bool parts_at_rest() const;  // all below the sleeping thresholds
+  bool parts_at_rest() const;  // all asleep: below the sleeping thresholds for their time
 
  private:
   struct Impl;
