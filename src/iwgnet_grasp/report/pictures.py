@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -79,17 +80,21 @@ def scene_picture(look: Look, panel_width: int = 800) -> np.ndarray:
 
 
 def boxes_picture(look: Look) -> np.ndarray:
-    """Figure 7: detections with label and score."""
-    image = look.color.copy()
+    """Figure 7: detections with label and score, on the part of the image that holds them."""
+    view = View.around(look)
+    image = view.image(look.color)
     for o in look.objects:
-        color = color_of(o.object_id)
-        outline(image, box_corners(o), color, 2)
-    canvas = Image.fromarray(image)
-    draw = ImageDraw.Draw(canvas)
-    for o in look.objects:
-        text = f"{o.object_id}  {o.label.replace('_', ' ')}  {o.score:.2f}"
-        tag(draw, (o.box.x - 1, o.box.y - 1), text, color_of(o.object_id), 15, above=True)
-    return titled(np.asarray(canvas), f"{len(look.objects)} objects detected")
+        outline(image, view.points(box_corners(o)), color_of(o.object_id), 2)
+    labels = [
+        Label(
+            f"{o.object_id}  {o.label.replace('_', ' ')}  {o.score:.2f}",
+            view.points(box_corners(o))[0],
+            color_of(o.object_id),
+        )
+        for o in look.objects
+    ]
+    image = with_labels(image, labels, [view.points(box_corners(o)) for o in look.objects])
+    return titled(image, f"{len(look.objects)} objects detected")
 
 
 def merged_depth_picture(look: Look, columns: int = 5, cell: int = 224) -> np.ndarray:
@@ -128,23 +133,21 @@ def grasps_picture(
 ) -> np.ndarray:
     """Figure 9: grasps with S* and their order in the image, the terms of Eq. 17-21 beside it."""
     chosen = chosen or {}
-    image = look.color.copy()
-    first = [(entry, chosen.get(entry.object.object_id)) for entry in ranking.objects]
-    for order, (entry, grasp) in enumerate(first, 1):
-        grasp = grasp or entry.object.grasps[0]
-        color = color_of(entry.object.object_id)
-        outline(image, box_corners(entry.object), color, 1)
-        draw_centroid(image, entry.object, color)
-        draw_grasp(image, grasp, color, 3 if order == 1 else 2)
-    canvas = Image.fromarray(image)
-    draw = ImageDraw.Draw(canvas)
-    for order, (entry, grasp) in enumerate(first, 1):
-        grasp = grasp or entry.object.grasps[0]
-        color = color_of(entry.object.object_id)
-        corner = grasp_corners(grasp).max(axis=0)
-        badge(draw, (corner[0] + 12, corner[1] + 2), str(order), color)
-        tag(draw, (corner[0] + 26, corner[1] - 8), f"S* {entry.priority:.2f}", color, 15)
-    picture = titled(np.asarray(canvas), "grasps in the order of S*  (dot: centroid)")
+    view = View.around(look)
+    image = view.image(look.color)
+    labels, occupied = [], []
+    for order, entry in enumerate(ranking.objects, 1):
+        o = entry.object
+        color = color_of(o.object_id)
+        corners = view.points(grasp_corners(chosen.get(o.object_id, o.grasps[0])))
+        outline(image, view.points(box_corners(o)), color, 1)
+        if o.valid_pixels:
+            draw_centroid(image, view.points([[o.centroid_u_px, o.centroid_v_px]])[0], color)
+        draw_grasp(image, corners, color, 4 if order == 1 else 3)
+        labels.append(Label(f"{order}:  S* {entry.priority:.2f}", corners.mean(0), color))
+        occupied.append(corners)
+    image = with_labels(image, labels, occupied)
+    picture = titled(image, "grasps in the order of S*  (dot: centroid, cross: grasp point)")
     return beside([picture, score_table(ranking, picture.shape[0])])
 
 
@@ -238,10 +241,9 @@ def grasp_corners(grasp: GraspRectangle) -> np.ndarray:
 
 
 def draw_grasp(
-    image: np.ndarray, grasp: GraspRectangle, color: Sequence[int], thickness: int = 2
+    image: np.ndarray, corners: np.ndarray, color: Sequence[int], thickness: int = 3
 ) -> None:
-    """Jaw plates thick and in colour, the opening between them thin."""
-    corners = grasp_corners(grasp)
+    """Jaw plates thick and in colour, the opening between them thin; corners: grasp_corners."""
     for width, ink in ((thickness + 3, INK), (thickness + 1, color)):
         line(image, corners[0], corners[1], ink, width)
         line(image, corners[2], corners[3], ink, width)
@@ -249,16 +251,13 @@ def draw_grasp(
     line(image, corners[3], corners[0], color, 1)
     line(image, corners[:2].mean(0), corners[2:].mean(0), color, 1)
     center = corners.mean(0)
-    arm = np.array([4.0, 0.0]), np.array([0.0, 4.0])
-    for a in arm:
-        line(image, center - a, center + a, (255, 255, 255), 2)
+    for arm in (np.array([6.0, 0.0]), np.array([0.0, 6.0])):
+        line(image, center - arm, center + arm, (255, 255, 255), 2)
 
 
-def draw_centroid(image: np.ndarray, target: ObjectGrasps, color: Sequence[int]) -> None:
-    if target.valid_pixels:
-        at = _fixed((target.centroid_u_px, target.centroid_v_px))
-        cv2.circle(image, at, 5 * 16, INK, -1, cv2.LINE_AA, 4)
-        cv2.circle(image, at, 4 * 16, tuple(color), -1, cv2.LINE_AA, 4)
+def draw_centroid(image: np.ndarray, at: np.ndarray, color: Sequence[int]) -> None:
+    cv2.circle(image, _fixed(at), 6 * 16, INK, -1, cv2.LINE_AA, 4)
+    cv2.circle(image, _fixed(at), 4 * 16, tuple(color), -1, cv2.LINE_AA, 4)
 
 
 def box_corners(target: ObjectGrasps) -> np.ndarray:
@@ -278,20 +277,107 @@ def line(
     cv2.line(image, _fixed(a), _fixed(b), tuple(int(c) for c in color), width, cv2.LINE_AA, 4)
 
 
-def tag(
-    draw: ImageDraw.ImageDraw,
-    at: tuple[float, float],
-    text: str,
-    color: Sequence[int],
-    size: int,
-    above: bool = False,
-) -> None:
-    """Dark letters on a coloured plate whose upper (or lower) left corner is `at`."""
-    left, top, right, bottom = draw.textbbox((0, 0), text, font(size))
-    height = bottom - top + 6
-    y = at[1] - height if above and at[1] >= height else at[1]
-    draw.rectangle((at[0], y, at[0] + right - left + 8, y + height), tuple(color))
-    draw.text((at[0] + 4 - left, y + 3 - top), text, INK, font(size))
+@dataclass(frozen=True)
+class View:
+    """A magnified part of the image: shown px = scale * (image px - (x, y))."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    scale: float
+
+    @staticmethod
+    def around(look: Look, margin: int = 70, least: tuple[int, int] = (560, 420)) -> View:
+        """The boxes of a look with a margin, at least `least` (width, height) px; all of the
+        image when there are none."""
+        rows, columns = look.color.shape[:2]
+        if not look.objects:
+            return View(0, 0, columns, rows, 1.0)
+        corners = np.concatenate([box_corners(o) for o in look.objects])
+        low, high = corners.min(0) - margin, corners.max(0) + margin
+        spare = np.maximum(np.array(least) - (high - low), 0) / 2
+        low = np.clip(np.floor(low - spare), 0, [columns, rows]).astype(int)
+        high = np.clip(np.ceil(high + spare), 0, [columns, rows]).astype(int)
+        width, height = (int(v) for v in high - low)
+        scale = min(1280 / width, 960 / height, 2.0)
+        return View(int(low[0]), int(low[1]), width, height, scale)
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        part = image[self.y : self.y + self.height, self.x : self.x + self.width]
+        size = round(self.width * self.scale), round(self.height * self.scale)
+        return cv2.resize(part, size, interpolation=cv2.INTER_CUBIC)
+
+    def points(self, points: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+        """(N, 2) image px -> shown px, both counted from the middle of the first pixel."""
+        return (np.asarray(points, float) - [self.x, self.y] + 0.5) * self.scale - 0.5
+
+
+@dataclass(frozen=True)
+class Label:
+    text: str
+    at: np.ndarray  # (2,) the point it belongs to
+    color: tuple[int, int, int]
+
+
+def with_labels(
+    image: np.ndarray, labels: Sequence[Label], occupied: Sequence[np.ndarray], size: int = 18
+) -> np.ndarray:
+    """The image with each label near its point, joined to it by a line where it had to move.
+
+    A label keeps off the others and, as far as it can, off the `occupied` outlines (corners).
+    """
+    canvas = Image.fromarray(image)
+    draw = ImageDraw.Draw(canvas)
+    bounds = image.shape[1], image.shape[0]
+    busy = [(*c.min(0), *c.max(0)) for c in occupied]
+    placed: list[tuple[float, float, float, float]] = []
+    plates = []
+    for label in labels:
+        left, top, right, bottom = draw.textbbox((0, 0), label.text, font(size), anchor="ls")
+        extent = np.array([right - left + 14, size + 8])
+        plate = _free_plate(label.at, extent, bounds, placed, busy)
+        placed.append(plate)
+        plates.append((label, plate))
+    for label, plate in plates:
+        nearest = np.clip(label.at, plate[:2], plate[2:])
+        if np.hypot(*(nearest - label.at)) > 4:
+            draw.line([*label.at, *nearest], INK, 4)
+            draw.line([*label.at, *nearest], label.color, 2)
+    for label, plate in plates:
+        draw.rounded_rectangle(plate, 5, label.color, INK, 1)
+        middle = (plate[0] + plate[2]) / 2, (plate[1] + plate[3]) / 2
+        draw.text(middle, label.text, INK, font(size), anchor="mm")
+    return np.asarray(canvas)
+
+
+def _free_plate(
+    at: np.ndarray,
+    extent: np.ndarray,
+    bounds: tuple[int, int],
+    placed: Sequence[tuple[float, float, float, float]],
+    busy: Sequence[tuple[float, float, float, float]],
+) -> tuple[float, float, float, float]:
+    """x1, y1, x2, y2 of the best place around a point: least covered, then nearest."""
+    best, least = None, math.inf
+    for radius in (0.0, 24.0, 48.0, 80.0, 120.0, 170.0, 230.0):
+        for step in range(16):
+            angle = -math.pi / 2 + step * math.pi / 8
+            direction = np.array([math.cos(angle), math.sin(angle)])
+            middle = at + direction * (radius + np.abs(direction) @ extent / 2)
+            low = np.clip(middle - extent / 2, 2, np.array(bounds) - extent - 2)
+            plate = (*low, *(low + extent))
+            cost = radius + sum(200.0 + _overlap(plate, p) for p in placed if _overlap(plate, p))
+            cost += sum(0.06 * _overlap(plate, b) for b in busy)
+            if cost < least:
+                best, least = plate, cost
+    return best
+
+
+def _overlap(a: Sequence[float], b: Sequence[float]) -> float:
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    return max(width, 0.0) * max(height, 0.0)
 
 
 def badge(
@@ -343,4 +429,4 @@ def _fixed(point: Sequence[float]) -> tuple[int, int]:
 
 
 def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
