@@ -36,30 +36,30 @@ cv::Mat align_depth(const cv::Mat& depth, const PinholeIntrinsics& from,
   const Eigen::Matrix3f R = T_to_from.rotation().cast<float>();
   const Eigen::Vector3f t = T_to_from.translation().cast<float>();
   const float fx = to.fx, fy = to.fy, cx = to.cx, cy = to.cy;
+  const Eigen::Vector3f across = R.col(0) / from.fx, diagonal = across + R.col(1) / from.fy;
   constexpr float kFar = std::numeric_limits<float>::infinity();
   cv::Mat aligned(to.height, to.width, CV_32FC1, cv::Scalar(kFar));
   for (int v = 0; v < depth.rows; ++v) {
     const float* row = depth.ptr<float>(v);
-    const float y0 = (v - 0.5f - from.cy) / from.fy, y1 = (v + 0.5f - from.cy) / from.fy;
+    const Eigen::Vector3f first = R * deproject(from, -0.5, v - 0.5, 1.0).cast<float>();
     for (int u = 0; u < depth.cols; ++u) {
       const float z = row[u];
-      if (!(z > 0.0f) || !std::isfinite(z)) continue;
-      const float x0 = (u - 0.5f - from.cx) / from.fx, x1 = (u + 0.5f - from.cx) / from.fx;
-      const Eigen::Vector3f a = R * Eigen::Vector3f(x0 * z, y0 * z, z) + t;
-      const Eigen::Vector3f b = R * Eigen::Vector3f(x1 * z, y1 * z, z) + t;
+      if (!(z > 0.0f) || z == kFar) continue;
+      const Eigen::Vector3f a = (first + across * static_cast<float>(u)) * z + t;
+      const Eigen::Vector3f b = a + diagonal * z;
       if (a.z() <= 0.0f || b.z() <= 0.0f) continue;
-      const float ax = fx * a.x() / a.z() + cx, bx = fx * b.x() / b.z() + cx;
-      const float ay = fy * a.y() / a.z() + cy, by = fy * b.y() / b.z() + cy;
-      const int left = std::max(0, static_cast<int>(std::ceil(std::min(ax, bx))));
-      const int right = std::min(to.width - 1, static_cast<int>(std::floor(std::max(ax, bx))));
-      const int top = std::max(0, static_cast<int>(std::ceil(std::min(ay, by))));
-      const int bottom = std::min(to.height - 1, static_cast<int>(std::floor(std::max(ay, by))));
+      const float a_inverse = 1.0f / a.z(), b_inverse = 1.0f / b.z();
+      const float ax = fx * a.x() * a_inverse + cx, bx = fx * b.x() * b_inverse + cx;
+      const float ay = fy * a.y() * a_inverse + cy, by = fy * b.y() * b_inverse + cy;
+      const int left = std::max(0, cvCeil(std::min(ax, bx)));
+      const int right = std::min(to.width - 1, cvFloor(std::max(ax, bx)));
+      const int top = std::max(0, cvCeil(std::min(ay, by)));
+      const int bottom = std::min(to.height - 1, cvFloor(std::max(ay, by)));
       const float seen = 0.5f * (a.z() + b.z());
-      for (int y = top; y <= bottom; ++y)
-        for (int x = left; x <= right; ++x) {
-          float& nearest = aligned.at<float>(y, x);
-          nearest = std::min(nearest, seen);
-        }
+      for (int y = top; y <= bottom; ++y) {
+        float* out = aligned.ptr<float>(y);
+        for (int x = left; x <= right; ++x) out[x] = std::min(out[x], seen);
+      }
     }
   }
   for (int y = 0; y < to.height; ++y)

@@ -94,27 +94,36 @@ void require_camera(const PinholeIntrinsics& k) {
     throw Error("renderer: the camera needs a positive size and focal length");
 }
 
+// The rays of 4 x 4 pixels. What is the same for all tiles of a camera is written once.
 struct Packet {
   alignas(64) int valid[kLanes];
   RTCRayHit16 hit;
+  alignas(64) float dx[kLanes], dy[kLanes], dz[kLanes];  // lane's direction against the tile's first
 
-  // The rays of the tile whose top left pixel is (u, v).
-  void aim(const RayFrame& frame, const PinholeIntrinsics& camera, int u, int v) {
+  Packet(const RayFrame& frame) {
     for (int i = 0; i < kLanes; ++i) {
-      const int x = u + i % kTile, y = v + i / kTile;
-      valid[i] = x < camera.width && y < camera.height ? -1 : 0;
-      const Vec3 d = frame.direction(x, y);
+      const Vec3 d = frame.right * static_cast<float>(i % kTile) +
+                     frame.down * static_cast<float>(i / kTile);
+      dx[i] = d.x, dy[i] = d.y, dz[i] = d.z;
       hit.ray.org_x[i] = frame.origin.x;
       hit.ray.org_y[i] = frame.origin.y;
       hit.ray.org_z[i] = frame.origin.z;
-      hit.ray.dir_x[i] = d.x;
-      hit.ray.dir_y[i] = d.y;
-      hit.ray.dir_z[i] = d.z;
       hit.ray.tnear[i] = 0.0f;
-      hit.ray.tfar[i] = kFar;
       hit.ray.time[i] = 0.0f;
       hit.ray.mask[i] = -1u;
       hit.ray.flags[i] = 0;
+    }
+  }
+
+  // Aims at the tile whose top left pixel is (u, v).
+  void aim(const RayFrame& frame, const PinholeIntrinsics& camera, int u, int v) {
+    const Vec3 first = frame.direction(u, v);
+    for (int i = 0; i < kLanes; ++i) {
+      valid[i] = u + i % kTile < camera.width && v + i / kTile < camera.height ? -1 : 0;
+      hit.ray.dir_x[i] = first.x + dx[i];
+      hit.ray.dir_y[i] = first.y + dy[i];
+      hit.ray.dir_z[i] = first.z + dz[i];
+      hit.ray.tfar[i] = kFar;
       hit.hit.geomID[i] = RTC_INVALID_GEOMETRY_ID;
       hit.hit.instID[0][i] = RTC_INVALID_GEOMETRY_ID;
     }
@@ -142,6 +151,17 @@ struct ShadowPacket {
   bool free(int lane) const { return ray.tfar[lane] >= 0.0f; }  // Embree sets -inf when occluded
 };
 
+// Whether the four pixels from x0 in each of the rows hold `value`.
+bool uniform(const cv::Mat& image, int x0, int y0, int y1, std::uint8_t value) {
+  const std::uint32_t all = value * 0x01010101u;
+  for (int y = y0; y < y1; ++y) {
+    std::uint32_t four;
+    std::memcpy(&four, image.ptr<std::uint8_t>(y) + x0, sizeof four);
+    if (four != all) return false;
+  }
+  return true;
+}
+
 }  // namespace
 
 struct Renderer::Impl {
@@ -150,6 +170,7 @@ struct Renderer::Impl {
   std::vector<Mesh> meshes;
   std::vector<Instance> instances;
   bool dirty = true;
+  struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color(), reused
 
   Impl() : device(rtcNewDevice(nullptr)) {
     if (!device) throw Error("renderer: Embree cannot start on this machine");
@@ -199,14 +220,13 @@ struct Renderer::Impl {
   // Calls write(u, v, lane, packet) for every pixel after its packet was traced.
   template <typename Write>
   void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write) {
-    require_camera(camera);
     commit();
     const RayFrame frame(camera, T_base_camera);
     parallel_rows(camera.height, kTile, [&](int first, int) {
       RTCIntersectContext context;
       rtcInitIntersectContext(&context);
       context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-      Packet packet;
+      Packet packet(frame);
       for (int u = 0; u < camera.width; u += kTile) {
         packet.aim(frame, camera, u, first);
         rtcIntersect16(packet.valid, scene, &context, &packet.hit);
@@ -308,6 +328,7 @@ void Renderer::clear_instances() {
 }
 
 cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
+  require_camera(camera);
   cv::Mat depth(camera.height, camera.width, CV_32FC1);
   impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
     const float t = packet.hit.ray.tfar[lane];
@@ -317,6 +338,7 @@ cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_came
 }
 
 cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
+  require_camera(camera);
   cv::Mat ids(camera.height, camera.width, CV_32SC1);
   impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
     ids.ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);  // invalid is -1
@@ -326,16 +348,21 @@ cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_
 
 cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                         const Light& light, double noise_sigma, std::uint64_t seed) {
+  require_camera(camera);
   const Lighting lighting(light, T_base_camera);
   // Each pixel of a 4 x 4 block looks at another part of the lamp and of the sky; the mean over
   // the block's 16 neighbours then is a soft shadow at the price of one ray (interleaved sampling).
   enum : std::uint8_t { kLit = 1, kOpen = 2 };
   const int width = camera.width, height = camera.height;
-  cv::Mat visibility(height, width, CV_8UC1, cv::Scalar(kLit | kOpen));
-  cv::Mat direct(height, width, CV_32FC3), ambient(height, width, CV_32FC3);
-  cv::Mat depth(height, width, CV_32FC1), ids(height, width, CV_32SC1);
+  auto& [visibility, direct, ambient, depth, ids, linear] = impl_->frame;
+  visibility.create(height, width, CV_8UC1);
+  visibility.setTo(kLit | kOpen);
+  direct.create(height, width, CV_32FC3);
+  ambient.create(height, width, CV_32FC3);
+  linear.create(height, width, CV_32FC3);
+  depth.create(height, width, CV_32FC1);
+  ids.create(height, width, CV_32SC1);
 
-  require_camera(camera);
   impl_->commit();
   const RayFrame frame(camera, T_base_camera);
   parallel_rows(height, kTile, [&](int first, int) {
@@ -343,7 +370,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
     rtcInitIntersectContext(&context);
     rtcInitIntersectContext(&shadow_context);
     context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-    Packet packet;
+    Packet packet(frame);
     ShadowPacket lamp, sky;
     for (int u = 0; u < width; u += kTile) {
       packet.aim(frame, camera, u, first);
@@ -386,7 +413,6 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
     }
   });
 
-  cv::Mat linear(height, width, CV_32FC3);
   parallel_rows(height, 16, [&](int first, int last) {
     for (int y = first; y < last; ++y) {
       const int y0 = std::clamp(y - 1, 0, std::max(0, height - kTile));
@@ -394,6 +420,14 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
       for (int x = 0; x < width; ++x) {
         const int x0 = std::clamp(x - 1, 0, std::max(0, width - kTile));
         const int x1 = std::min(x0 + kTile, width);
+        const Vec3 own_direct = direct.ptr<Vec3>(y)[x], own_ambient = ambient.ptr<Vec3>(y)[x];
+        Vec3& out = linear.ptr<Vec3>(y)[x];
+        const std::uint8_t own = visibility.ptr<std::uint8_t>(y)[x];
+        if (width >= kTile && uniform(visibility, x0, y0, y1, own)) {  // most of the image
+          out = own_direct * static_cast<float>(own & kLit) +
+                own_ambient * static_cast<float>(own >> 1);
+          continue;
+        }
         const int id = ids.ptr<int>(y)[x];
         const float z = depth.ptr<float>(y)[x];
         int lit = 0, open = 0, count = 0;
@@ -409,8 +443,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
           }
         }
         const float weight = count > 0 ? 1.0f / count : 0.0f;
-        linear.ptr<Vec3>(y)[x] = direct.ptr<Vec3>(y)[x] * (lit * weight) +
-                                 ambient.ptr<Vec3>(y)[x] * (count > 0 ? open * weight : 1.0f);
+        out = own_direct * (lit * weight) + own_ambient * (count > 0 ? open * weight : 1.0f);
       }
     }
   });

@@ -13,7 +13,8 @@ constexpr int kTexels = 512;             // side of a noise texture; it repeats
 constexpr float kMottleTexel = 0.0006f;  // m, of the grain of matt surfaces
 constexpr float kBrushTexel = 0.00025f;  // m, across the brushing of metal ...
 constexpr float kBrushStretch = 24.0f;   // ... and so many times longer along it
-constexpr float kBrushTilt = 0.16f;      // rad, how far brushing tilts the surface
+constexpr float kBrushTilt = 0.10f;      // rad, how far brushing tilts the surface
+constexpr float kBrushSpread = 0.12f;    // what brushing too fine to see adds to the highlight's width
 constexpr float kMinRoughness = 0.04f;
 constexpr float kDielectricF0 = 0.04f;   // reflectance of plastics and paint seen head-on
 constexpr float kHorizon = 0.55f, kCeiling = 1.05f, kFloor = 0.22f;  // brightness of the room
@@ -59,7 +60,7 @@ Texture noise_texture(std::uint64_t seed, int first_cell, int octaves) {
 }
 
 const Texture& mottle() {
-  static const Texture texture = noise_texture(1, 64, 6);
+  static const Texture texture = noise_texture(1, 32, 6);
   return texture;
 }
 const Texture& brushing() {
@@ -68,8 +69,8 @@ const Texture& brushing() {
 }
 
 float lookup(const Texture& texture, float x, float y) {
-  const int i = static_cast<int>(std::floor(x)) & (kTexels - 1);
-  const int j = static_cast<int>(std::floor(y)) & (kTexels - 1);
+  const int i = cvFloor(x) & (kTexels - 1);
+  const int j = cvFloor(y) & (kTexels - 1);
   return texture[j * kTexels + i];
 }
 
@@ -183,7 +184,7 @@ Vec3 Lighting::room(const Vec3& direction, float roughness) const {
   // Ceiling with rows of strip lights, which only smooth metal resolves.
   const float sharp = (1.0f - roughness) * (1.0f - roughness);
   const float phase = direction.x / std::max(up, 0.25f) * 1.7f;
-  const float wave = 1.0f - 4.0f * std::abs(phase - std::floor(phase) - 0.5f);
+  const float wave = 1.0f - 4.0f * std::abs(phase - cvFloor(phase) - 0.5f);
   const float sky = kHorizon + (kCeiling - kHorizon) * up + 0.55f * sharp * wave * up;
   const float s = smoothstep(-blur, blur, direction.z);
   const float value = kFloor + (sky - kFloor) * s;
@@ -218,7 +219,8 @@ void Lighting::shade(const Surface& surface, const Material& material,
   *direct = {0, 0, 0};
   if (cosine > 0.0f) {
     const Vec3 half = normalized(to_lamp + surface.to_eye);
-    const float alpha = std::min(1.0f, roughness * roughness + 0.5f * radius_ / distance);
+    const float alpha =
+        std::min(1.0f, roughness * roughness + 0.5f * radius_ / distance + kBrushSpread * metallic);
     const float alpha2 = alpha * alpha;
     const float nh = dot(normal, half);
     const float denominator = nh * nh * (alpha2 - 1.0f) + 1.0f;

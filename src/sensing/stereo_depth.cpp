@@ -1,8 +1,10 @@
 #include "iwgnet_grasp/sensing/stereo_depth.h"
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
+#include <vector>
 
 #include "parallel.h"
 
@@ -13,6 +15,37 @@ constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr int kQuantileBits = 14;
 // A match is kept when both imagers agree on the disparity this well, as stereo matchers check.
 constexpr float kLeftRightTolerance = 0.75f;  // px
+
+// What the right imager sees of the surfaces that the left one sees. An occluder that the left
+// imager cannot see at all is missing; it would have to stand in another part's shadow.
+cv::Mat right_view(const cv::Mat& left, float fB) {
+  cv::Mat right(left.size(), CV_32FC1);
+  const int width = left.cols;
+  parallel_rows(left.rows, 16, [&](int first, int last) {
+    std::vector<float> nearest(width);  // disparity, px; 0 where nothing was seen
+    for (int v = first; v < last; ++v) {
+      const float* in = left.ptr<float>(v);
+      std::fill(nearest.begin(), nearest.end(), 0.0f);
+      int before = -1;
+      float disparity_before = 0.0f;
+      for (int u = 0; u < width; ++u) {
+        if (!(in[u] > 0.0f)) continue;
+        const float disparity = fB / in[u];
+        const int seen = cvRound(u - disparity);
+        if (seen < 0 || seen >= width) continue;
+        nearest[seen] = std::max(nearest[seen], disparity);
+        // A slanted surface that the right imager sees wider leaves no gap.
+        if (seen == before + 2 && std::abs(disparity - disparity_before) < 1.5f)
+          nearest[seen - 1] = std::max(nearest[seen - 1], std::min(disparity, disparity_before));
+        before = seen;
+        disparity_before = disparity;
+      }
+      float* out = right.ptr<float>(v);
+      for (int u = 0; u < width; ++u) out[u] = nearest[u] > 0.0f ? fB / nearest[u] : kNaN;
+    }
+  });
+  return right;
+}
 
 // Quantiles of the standard normal distribution at (i + 1/2) / 2^14, by Newton's method on its
 // distribution function: a table look-up a draw instead of a logarithm and a cosine.
@@ -68,18 +101,18 @@ cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
           return normal[(bits >> (i * kQuantileBits)) & ((1 << kQuantileBits) - 1)];
         };
         if ((bits >> 42) < outliers) continue;
-        const int us = std::clamp(static_cast<int>(std::lrint(u + lateral * draw(0))), 0, width - 1);
-        const int vs = std::clamp(static_cast<int>(std::lrint(v + lateral * draw(1))), 0, height - 1);
+        const int us = std::clamp(cvRound(u + lateral * draw(0)), 0, width - 1);
+        const int vs = std::clamp(cvRound(v + lateral * draw(1)), 0, height - 1);
         const float z = ideal_left.at<float>(vs, us);
         if (!(z > 0.0f)) continue;
         const float disparity = fB / z;
         // Shadow: the second imager must see the same point at u - d.
-        const int ur = static_cast<int>(std::lrint(us - disparity));
+        const int ur = cvRound(us - disparity);
         if (ur < 0) continue;
         const float z_right = ideal_right.at<float>(vs, ur);
         if (z_right > 0.0f && fB / z_right > disparity + kLeftRightTolerance) continue;
         const float noisy = disparity + sigma * draw(2);
-        const float rounded = step > 0.0f ? std::nearbyint(noisy / step) * step : noisy;
+        const float rounded = step > 0.0f ? cvRound(noisy / step) * step : noisy;
         if (rounded < min_disparity || rounded > max_disparity) continue;
         out[u] = fB / rounded;
       }
@@ -89,10 +122,9 @@ cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
 }
 
 cv::Mat capture_depth(Renderer& renderer, const CameraConfig& camera, std::uint64_t seed) {
-  const Pose T_base_left = camera.T_base_depth();
-  const Pose T_base_right = T_base_left * Eigen::Translation3d(camera.baseline, 0.0, 0.0);
-  return stereo_depth(renderer.depth(camera.depth, T_base_left),
-                      renderer.depth(camera.depth, T_base_right), camera, seed);
+  const cv::Mat left = renderer.depth(camera.depth, camera.T_base_depth());
+  const float fB = camera.depth.fx * camera.baseline;
+  return stereo_depth(left, right_view(left, fB), camera, seed);
 }
 
 }  // namespace iwgnet_grasp::sensing

@@ -21,7 +21,7 @@ double depth_from_disparity(double disparity_px, double fx_px, double baseline_m
 cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
                      const CameraConfig& camera, std::uint64_t seed);
 
-// Renders both imagers and measures.
+// Renders the left imager, derives the right one's view from it and measures.
 cv::Mat capture_depth(Renderer& renderer, const CameraConfig& camera, std::uint64_t seed);
 
 }  // namespace iwgnet_grasp::sensing
