@@ -102,9 +102,7 @@ void CollisionWorld::set_attached(const std::optional<AttachedPart>& part) {
   rebuild();
 }
 
-void CollisionWorld::set_grasp_column(const std::optional<Eigen::Vector2d>& column) {
-  column_ = column;
-}
+void CollisionWorld::set_columns(const std::vector<Eigen::Vector2d>& columns) { columns_ = columns; }
 
 // Sphere sizes: fitted to the collision meshes of ur_description and of the 2F-85, which they cover
 // (test_motion_collision).
@@ -154,7 +152,9 @@ void CollisionWorld::rebuild() {
       row(kFingers, 6, mirrored(knuckle + Eigen::Vector3d(0.006, y, 0.006)),
           mirrored(knuckle + (joint - pivot) * 0.8 + Eigen::Vector3d(-0.006, y, 0.0)), 0.015, 3);
     row(kFingers, 6, mirrored({joint_x - 0.006, 0, joint_z + 0.006}),
-        mirrored({face + 0.011, 0, tip - 0.012}), 0.013, 4);
+        mirrored({face + 0.011, 0, tip - 0.026}), 0.013, 3);
+    row(kFingers, 6, mirrored({face + 0.0085, 0, tip - 0.018}), mirrored({face + 0.007, 0, tip - 0.0095}),
+        0.0095, 2);
     // The tip is met exactly in height, its edges by small spheres.
     for (const double y : {-0.006, 0.006})
       row(kFingers, 6, mirrored({face + 0.005, y, pad_z - 0.014}), mirrored({face + 0.005, y, tip - 0.007}),
@@ -170,28 +170,42 @@ void CollisionWorld::rebuild() {
   if (static_cast<int>(spheres_.size()) > kCapacity)
     throw Error("CollisionWorld: more than " + std::to_string(kCapacity) + " spheres");
   int i = 0;
-  for (int body = 0; body <= kHeldPart + 1; ++body) {
-    while (i < static_cast<int>(spheres_.size()) && spheres_[i].body < body) ++i;
-    first_[body] = i;
+  const int count = static_cast<int>(spheres_.size());
+  for (int body = 0; body < kBodies; ++body) {
+    BodySpheres& range = bodies_[body];
+    range = BodySpheres();
+    range.first = i;
+    Eigen::AlignedBox3d extent;
+    for (; i < count && spheres_[i].body == body; ++i) {
+      range.frame = spheres_[i].frame;
+      extent.extend(spheres_[i].center);
+    }
+    range.end = i;
+    if (range.first == range.end) continue;
+    range.center = extent.center();
+    for (int k = range.first; k < range.end; ++k)
+      range.radius = std::max(range.radius, (spheres_[k].center - range.center).norm() + spheres_[k].radius);
   }
 }
 
-void CollisionWorld::place(const JointVector& q, Placed& placed) const {
-  const auto frames = kinematics::link_frames(q);
-  for (std::size_t i = 0; i < spheres_.size(); ++i) {
-    const LocalSphere& s = spheres_[i];
-    const Eigen::Vector3d p = s.frame == 0 ? s.center : frames[s.frame - 1] * s.center;
+void CollisionWorld::place(Body body, const Frames& frames, Placed& placed) const {
+  const BodySpheres& range = bodies_[body];
+  const Pose T = range.frame == 0 ? Pose::Identity() : frames[range.frame - 1];
+  for (int i = range.first; i < range.end; ++i) {
+    const Eigen::Vector3d p = T * spheres_[i].center;
     placed.x[i] = p.x();
     placed.y[i] = p.y();
     placed.z[i] = p.z();
-    placed.r[i] = s.radius;
+    placed.r[i] = spheres_[i].radius;
   }
 }
 
-bool CollisionWorld::in_grasp_column(const JointVector& q) const {
-  if (!column_) return false;
-  const Pose T = kinematics::forward(q);
-  return -T(2, 2) > kColumnTilt && (T.translation().head<2>() - *column_).norm() < kColumnRadius;
+bool CollisionWorld::in_column(const Pose& T_base_tool0) const {
+  if (-T_base_tool0(2, 2) < kColumnTilt) return false;
+  const Eigen::Vector2d tool = T_base_tool0.translation().head<2>();
+  return std::any_of(columns_.begin(), columns_.end(), [&](const Eigen::Vector2d& column) {
+    return (tool - column).norm() < kColumnRadius;
+  });
 }
 
 bool CollisionWorld::touches_heights(double x, double y, double z, double radius) const {
@@ -230,35 +244,56 @@ bool CollisionWorld::touches_heights(double x, double y, double z, double radius
 
 template <typename Report>
 bool CollisionWorld::check(const JointVector& q, Report&& report) const {
+  const Frames frames = kinematics::link_frames(q);
+  const bool column = in_column(frames[kJoints - 1]);
+  const int last = attached_ && !column ? kHeldPart : kFingers;
+
+  // Spheres around whole bodies come first; the spheres of a body are placed when it is near.
   Placed p;
-  place(q, p);
-  const bool column = in_grasp_column(q);
-  const int end = first_[kHeldPart + 1];
-  const int boxed_end = column ? first_[kHeldPart] : end;
   const double *x = p.x.data(), *y = p.y.data(), *z = p.z.data(), *r = p.r.data();
+  std::array<Eigen::Vector3d, kBodies> around;
+  for (int body = 0; body <= last; ++body)
+    around[body] = bodies_[body].frame == 0 ? bodies_[body].center
+                                            : frames[bodies_[body].frame - 1] * bodies_[body].center;
+  unsigned placed = 0;
+  const auto near = [&](int body) {
+    if (!(placed >> body & 1u)) place(static_cast<Body>(body), frames, p);
+    placed |= 1u << body;
+  };
 
   // The base and the shoulder stand on the table and never leave it.
-  for (const Obstacle& box : obstacles_) {
-    if (!any_in_box(x, y, z, r, first_[kUpperArm], boxed_end, box.center.data(), box.half.data()))
-      continue;
-    for (int body = kUpperArm; body <= kHeldPart; ++body)
-      if (any_in_box(x, y, z, r, first_[body], std::min(first_[body + 1], boxed_end),
-                     box.center.data(), box.half.data()) &&
+  for (int body = kUpperArm; body <= last; ++body) {
+    const BodySpheres& range = bodies_[body];
+    for (const Obstacle& box : obstacles_) {
+      const Eigen::Vector3d away = ((around[body] - box.center).cwiseAbs() - box.half).cwiseMax(0.0);
+      if (away.squaredNorm() >= range.radius * range.radius) continue;
+      near(body);
+      if (any_in_box(x, y, z, r, range.first, range.end, box.center.data(), box.half.data()) &&
           report(kBodyNames[body], box.name))
         return true;
+    }
   }
-  const int over_parts_end = column ? first_[kFingers] : end;
-  for (int i = first_[kUpperArm]; i < over_parts_end; ++i)
-    if (touches_heights(x[i], y[i], z[i], r[i]) && report(kBodyNames[spheres_[i].body], "parts"))
-      return true;
+  for (int body = kUpperArm; body <= last; ++body) {
+    const BodySpheres& range = bodies_[body];
+    if (around[body].z() - range.radius >= heights_.max || (column && body >= kFingers)) continue;
+    near(body);
+    for (int i = range.first; i < range.end; ++i)
+      if (touches_heights(x[i], y[i], z[i], r[i]) && report(kBodyNames[body], "parts")) return true;
+  }
   for (const SelfPair& pair : kSelfPairs) {
-    const int moving_end = std::min(first_[pair.moving + 1], boxed_end);
-    for (int i = first_[pair.moving]; i < moving_end; ++i)
-      if (any_in_sphere(x, y, z, r, first_[pair.from], first_[pair.to + 1], i))
-        for (int body = pair.from; body <= pair.to; ++body)
-          if (any_in_sphere(x, y, z, r, first_[body], first_[body + 1], i) &&
-              report(kBodyNames[pair.moving], kBodyNames[body]))
-            return true;
+    if (pair.moving > last) continue;
+    const BodySpheres& moving = bodies_[pair.moving];
+    for (int body = pair.from; body <= pair.to; ++body) {
+      const BodySpheres& other = bodies_[body];
+      const double reach = moving.radius + other.radius;
+      if ((around[pair.moving] - around[body]).squaredNorm() >= reach * reach) continue;
+      near(pair.moving);
+      near(body);
+      for (int i = moving.first; i < moving.end; ++i)
+        if (any_in_sphere(x, y, z, r, other.first, other.end, i) &&
+            report(kBodyNames[pair.moving], kBodyNames[body]))
+          return true;
+    }
   }
   return false;
 }
@@ -281,11 +316,10 @@ std::string CollisionWorld::describe(const JointVector& q) const {
 }
 
 std::vector<CollisionWorld::Sphere> CollisionWorld::spheres(const JointVector& q) const {
-  Placed p;
-  place(q, p);
+  const Frames frames = kinematics::link_frames(q);
   std::vector<Sphere> result;
-  for (std::size_t i = 0; i < spheres_.size(); ++i)
-    result.push_back({spheres_[i].body, Eigen::Vector3d(p.x[i], p.y[i], p.z[i]), p.r[i]});
+  for (const LocalSphere& s : spheres_)
+    result.push_back({s.body, s.frame == 0 ? s.center : frames[s.frame - 1] * s.center, s.radius});
   return result;
 }
 

@@ -25,6 +25,7 @@ class CollisionWorld {
   // The arm's bodies in chain order; kHeldPart only while a part is attached.
   enum Body { kBase, kShoulder, kUpperArm, kForearm, kWrist1, kWrist2, kWrist3, kGripper, kFingers,
               kHeldPart };
+  static constexpr int kBodies = kHeldPart + 1;
 
   struct Sphere {
     Body body;
@@ -40,10 +41,10 @@ class CollisionWorld {
   // Places the fingers. Default: wide open.
   void set_gripper_gap(double gap);
   void set_attached(const std::optional<AttachedPart>& part);
-  // Within this column (radius 3 mm about x, y of base_link) a gripper that points down moves
+  // Within these columns (3 mm about x, y of tool0 in base_link) a gripper that points down moves
   // straight onto or off a part: there its fingers and the held part are not checked against the
   // heights, which the grasp pose has cleared already, nor the held part against anything.
-  void set_grasp_column(const std::optional<Eigen::Vector2d>& column);
+  void set_columns(const std::vector<Eigen::Vector2d>& columns);
 
   bool collides(const JointVector& q) const;
   // Names of what touches what, e.g. "wrist_3_link - camera"; empty when free.
@@ -52,7 +53,7 @@ class CollisionWorld {
   std::vector<Sphere> spheres(const JointVector& q) const;
 
  private:
-  static constexpr int kCapacity = 96;  // spheres
+  static constexpr int kCapacity = 112;  // spheres
 
   struct LocalSphere {
     Body body;
@@ -60,8 +61,14 @@ class CollisionWorld {
     Eigen::Vector3d center;  // in the frame
     double radius;
   };
+  using Frames = std::array<Pose, kJoints>;
+  struct BodySpheres {  // the spheres of a body and one around them all
+    int first = 0, end = 0, frame = 0;
+    Eigen::Vector3d center = Eigen::Vector3d::Zero();
+    double radius = 0.0;
+  };
   struct Placed {  // structure of arrays for the inner loops
-    alignas(64) std::array<double, kCapacity> x, y, z, r;
+    std::array<double, kCapacity> x, y, z, r;
   };
   struct Obstacle {
     std::string name;
@@ -75,8 +82,8 @@ class CollisionWorld {
   };
 
   void rebuild();
-  bool in_grasp_column(const JointVector& q) const;
-  void place(const JointVector& q, Placed& placed) const;
+  bool in_column(const Pose& T_base_tool0) const;
+  void place(Body body, const Frames& frames, Placed& placed) const;
   bool touches_heights(double x, double y, double z, double radius) const;
   // Calls report(name, name) for contacts until it returns true; returns whether it did.
   template <typename Report>
@@ -86,9 +93,9 @@ class CollisionWorld {
   Heights heights_;
   double gap_;
   std::optional<AttachedPart> attached_;
-  std::optional<Eigen::Vector2d> column_;
+  std::vector<Eigen::Vector2d> columns_;
   std::vector<LocalSphere> spheres_;  // in the order of Body
-  std::array<int, kHeldPart + 2> first_{};  // index of the first sphere of each body, and the end
+  std::array<BodySpheres, kBodies> bodies_;
 };
 
 }  // namespace iwgnet_grasp::motion

@@ -1,7 +1,12 @@
 // One pick: approach, grasp, lift, transfer, release, back to observing.
+//
+// The motion is planned whole before the arm moves and executed as three trajectories: observing ->
+// grasp, grasp -> tray slot, tray slot -> observing. Where they go straight up or down the tool is
+// slow; in between it passes corners without stopping.
 #pragma once
 
 #include <functional>
+#include <optional>
 #include <string>
 
 #include "iwgnet_grasp/grasping/grasp_pose.h"
@@ -29,18 +34,26 @@ class Robot {
   virtual JointVector joints() = 0;
   virtual ExecutionResult execute(const Trajectory& trajectory) = 0;
   virtual GripResult grip(double gap_m, double force_n) = 0;
+  // Starts the gripper moving; a robot that can returns at once, so that the arm moves meanwhile.
+  // Default: waits.
+  virtual GripResult preset(double gap_m, double force_n) { return grip(gap_m, force_n); }
 };
 
 struct PickPlaceConfig {  // config/motion.yaml
   PlannerConfig planner;
-  JointLimits limits;            // transfers
-  double approach_height;        // m, TCP above the grasp before and after
-  double approach_speed;         // m/s of the tool on the last stretch down
-  double lift_speed;             // m/s of the tool on the way up with a part
-  double grip_force;             // N
-  double held_gap_min;           // m, a smaller gap after closing means nothing is held
-  double release_margin;         // m, fingers open by this much beyond the object
-  double release_height;         // m, finger tips above the tray floor when letting go
+  JointLimits limits;             // free motion
+  JointLimits carry;              // with a part in the gripper
+  double carry_tool_acceleration; // m/s^2 along each axis
+  double corner_deviation;        // rad, see PathLeg
+  double approach_height;         // m, TCP above the grasp before and after
+  double approach_speed;          // m/s of the tool on the last stretch down
+  double lift_speed;              // m/s of the tool on the way up with a part
+  double grip_force;              // N
+  double held_gap_min;            // m, a smaller gap after closing means nothing is held
+  double held_length, held_radius;  // m, capsule that stands for a held part
+  double release_margin;          // m, fingers open by this much beyond the object
+  double release_height;          // m, part's lowest point above the tray floor when letting go
+  double max_hang;                // m, most that a part reaches below the finger tips
 };
 PickPlaceConfig load_pick_place_config(const std::string& config_dir);  // Throws Error.
 
@@ -67,6 +80,11 @@ struct PickResult {
   double planning_seconds = 0.0;  // wall
 };
 
+// The gripper opens before, closes between `approach` and `carry`, lets go before `retreat`.
+struct PickPlan {
+  Trajectory approach, carry, retreat;
+};
+
 class PickAndPlace {
  public:
   PickAndPlace(const CellConfig& cell, const PickPlaceConfig& config);
@@ -74,15 +92,28 @@ class PickAndPlace {
   // Heights of what lies on the table, from the scene that the grasp belongs to.
   void set_heights(const grasping::HeightMap& heights);
   // `phase` is told each phase's name as it begins; returning false cancels before the next.
+  // Whatever happens, the arm ends at the observing pose if it can be brought there.
   PickResult run(Robot& robot, const PickRequest& request,
                  const std::function<bool(const std::string&)>& phase = {});
   // Brings the arm to the observing pose.
   PickResult observe(Robot& robot);
 
+  // The whole motion from `start` without moving anything: reason kSucceeded fills `plan`.
+  PickResult plan_pick(const JointVector& start, const PickRequest& request, PickPlan& plan);
+
  private:
+  JointVector start_of(Robot& robot) const;
+  ExecutionResult move(Robot& robot, const Trajectory& trajectory);
+  // The fastest trajectory along the legs that is free of collision: corners are cut less where
+  // cutting them collides. Empty when even stops at the corners collide; `why` says with what.
+  Trajectory timed(std::vector<PathLeg> legs, std::string& why) const;
+  // After a transfer that stopped on the way: back to the grasp the way it came, and open.
+  void put_back(Robot& robot, const PickPlan& plan, double opening);
+
   CellConfig cell_;
   PickPlaceConfig config_;
   CollisionWorld world_;
+  std::optional<JointVector> commanded_;  // where the last trajectory ended
 };
 
 }  // namespace iwgnet_grasp::motion

@@ -1,0 +1,451 @@
+#include "iwgnet_grasp/motion/pick_and_place.h"
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cmath>
+#include <iterator>
+#include <limits>
+#include <sstream>
+
+#include "iwgnet_grasp/core/yaml.h"
+#include "iwgnet_grasp/kinematics/robotiq_2f85.h"
+#include "iwgnet_grasp/kinematics/ur5.h"
+
+namespace iwgnet_grasp::motion {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is where it was sent
+constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
+constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
+constexpr double kFarthestCentroid = 0.08;  // m from the grasp point: half a part; more is an error
+constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
+
+double seconds_since(Clock::time_point start) {
+  return std::chrono::duration<double>(Clock::now() - start).count();
+}
+
+// Least time for a motion at rest on both ends.
+double duration(const JointVector& from, const JointVector& to, const JointLimits& limits) {
+  double longest = 0.0;
+  for (int i = 0; i < kJoints; ++i) {
+    const double d = std::abs(to[i] - from[i]), v = limits.max_velocity[i], a = limits.max_acceleration[i];
+    longest = std::max(longest, d < v * v / a ? 2 * std::sqrt(d / a) : d / v + v / a);
+  }
+  return longest;
+}
+
+JointPath reversed(JointPath path) {
+  std::reverse(path.begin(), path.end());
+  return path;
+}
+
+Pose raised(Pose T, double height) {
+  T.translation().z() += height;
+  return T;
+}
+
+// About the approach axis by pi: the same grasp with the fingers exchanged.
+Pose half_turn(const Pose& T_base_tcp) {
+  Pose T = T_base_tcp;
+  T.linear().leftCols<2>() *= -1.0;
+  return T;
+}
+
+std::string millimetres(const Eigen::Vector3d& p) {
+  std::ostringstream text;
+  text << "(" << std::lround(p.x() * 1e3) << ", " << std::lround(p.y() * 1e3) << ", "
+       << std::lround(p.z() * 1e3) << ") mm";
+  return text.str();
+}
+
+// A pose over the table or the tray with its straight way up.
+struct Reached {
+  JointVector low, high;
+  JointPath up;  // low -> high
+  int turn;      // index of the pose
+};
+
+// All configurations that reach one of the TCP poses and rise from it free of collision in `world`.
+// `why` keeps the reason of the nearest that does not.
+std::vector<Reached> reach(const CollisionWorld& world, const std::array<Pose, 2>& T_base_tcp,
+                           double gap, double height, const JointVector& near,
+                           const JointLimits& limits, std::string& why) {
+  std::vector<Reached> found;
+  double nearest_failure = 1e9;
+  const auto failed = [&](const JointVector& q, const std::string& reason) {
+    const double cost = duration(near, q, limits);
+    if (cost < nearest_failure) {
+      nearest_failure = cost;
+      why = reason;
+    }
+  };
+  why = "out of the arm's reach";
+  for (int turn = 0; turn < 2; ++turn) {
+    const Pose T_tool0 = T_base_tcp[turn] * kinematics::T_tool0_tcp(gap).inverse();
+    const auto solutions = kinematics::inverse(T_tool0, near[5]);
+    for (int i = 0; i < solutions.count; ++i) {
+      const JointVector q = kinematics::nearest_turn(solutions.q[i], near);
+      const std::string contact = world.describe(q);
+      if (!contact.empty()) {
+        failed(q, "the arm would touch: " + contact);
+        continue;
+      }
+      PlanResult up = plan_straight(world, q, raised(T_tool0, height), true);
+      if (up.success)
+        found.push_back({q, up.path.back(), up.path, turn});
+      else
+        failed(q, up.message);
+    }
+  }
+  return found;
+}
+
+}  // namespace
+
+PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
+  const YamlFile file(config_dir + "/motion.yaml");
+  PickPlaceConfig config;
+  const auto positive = [&](const std::string& key) {
+    const double value = file.get<double>(key);
+    if (!(value > 0)) file.fail(key, "must be positive");
+    return value;
+  };
+  const auto limits = [&](const std::string& key) {
+    JointLimits result;
+    result.max_velocity = file.vector(key + ".max_velocity", kJoints);
+    result.max_acceleration = file.vector(key + ".max_acceleration", kJoints);
+    if (!(result.max_velocity.minCoeff() > 0) || !(result.max_acceleration.minCoeff() > 0))
+      file.fail(key, "needs positive velocities and accelerations");
+    return result;
+  };
+  config.planner.max_time = positive("planner.max_time");
+  config.planner.resolution = positive("planner.resolution");
+  config.planner.seed = file.get<std::uint64_t>("planner.seed");
+  config.limits = limits("limits");
+  config.carry = limits("carry");
+  config.carry_tool_acceleration = positive("carry.tool_acceleration");
+  config.corner_deviation = file.get<double>("corner_deviation");
+  if (!(config.corner_deviation >= 0)) file.fail("corner_deviation", "must not be negative");
+  config.approach_height = positive("approach_height");
+  config.approach_speed = positive("approach_speed");
+  config.lift_speed = positive("lift_speed");
+  config.grip_force = positive("grip_force");
+  config.held_gap_min = positive("held_gap_min");
+  config.held_length = positive("held_part.length");
+  config.held_radius = positive("held_part.radius");
+  config.release_margin = positive("release_margin");
+  config.release_height = positive("release_height");
+  config.max_hang = positive("max_hang");
+  return config;
+}
+
+PickAndPlace::PickAndPlace(const CellConfig& cell, const PickPlaceConfig& config)
+    : cell_(cell), config_(config), world_(cell) {}
+
+void PickAndPlace::set_heights(const grasping::HeightMap& heights) { world_.set_heights(heights); }
+
+Trajectory PickAndPlace::timed(std::vector<PathLeg> legs, std::string& why) const {
+  for (const double share : {1.0, 0.5, 0.2, 0.0}) {
+    for (PathLeg& leg : legs) leg.deviation = share * config_.corner_deviation;
+    Trajectory trajectory = time_parametrize(legs);
+    const auto contact = std::find_if(trajectory.begin(), trajectory.end(),
+                                      [&](const TrajectoryPoint& p) { return world_.collides(p.q); });
+    if (contact == trajectory.end()) return trajectory;
+    why = world_.describe(contact->q);
+  }
+  return {};
+}
+
+PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& request, PickPlan& plan) {
+  const auto began = Clock::now();
+  const auto finish = [&](PickReason reason, const std::string& message) {
+    return PickResult{reason, message, seconds_since(began)};
+  };
+  const grasping::GraspPose& grasp = request.grasp;
+  if (!grasp.feasible) return finish(PickReason::kInfeasible, "infeasible grasp: " + grasp.reason);
+  const bool finite = grasp.T_base_tcp.matrix().allFinite() && request.centroid.allFinite() &&
+                      std::isfinite(grasp.width) && std::isfinite(grasp.opening);
+  if (!finite) return finish(PickReason::kInfeasible, "infeasible grasp: its pose is not finite");
+  if (grasp.width < 0 || grasp.opening > kinematics::max_gap() + 1e-3 || grasp.opening < grasp.width)
+    return finish(PickReason::kInfeasible, "infeasible grasp: width and opening do not fit the 2F-85");
+  const auto slots = cell_.tray.slots();
+  if (request.tray_slot < 0 || request.tray_slot >= static_cast<int>(slots.size()))
+    return finish(PickReason::kInfeasible, "the tray has no slot " + std::to_string(request.tray_slot) +
+                                               ": it has " + std::to_string(slots.size()));
+
+  const Eigen::Vector3d at = grasp.T_base_tcp.translation();
+  const Eigen::Vector2d grasp_column = at.head<2>();
+  const double released = std::min(grasp.width + config_.release_margin, kinematics::max_gap());
+
+  // Grasp.
+  std::string why;
+  world_.set_attached(std::nullopt);
+  world_.set_gripper_gap(grasp.opening);
+  world_.set_columns({grasp_column});
+  const auto grasps = reach(world_, {grasp.T_base_tcp, half_turn(grasp.T_base_tcp)}, grasp.width,
+                            config_.approach_height, start, config_.limits, why);
+  if (grasps.empty())
+    return finish(PickReason::kUnreachable, "grasp at " + millimetres(at) + ": " + why);
+
+  // Slot: closing direction along base x, so the grasped rod lies along y; the part's centroid over
+  // the slot's centre. The part reaches no lower below the tips than the table did.
+  const double tip = at.z() - kinematics::kPadHeight / 2;
+  const double hang = std::clamp(tip, 0.0, config_.max_hang);
+  Eigen::Vector3d offset = grasp.T_base_tcp.linear().transpose() * (request.centroid - at);
+  offset.z() = 0.0;
+  if (offset.norm() > kFarthestCentroid) offset *= kFarthestCentroid / offset.norm();
+  const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
+  const auto slot_poses = [&](int grasp_turn) {
+    Pose T = Pose::Identity();
+    T.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
+    std::array<Pose, 2> poses{T, half_turn(T)};
+    for (Pose& pose : poses) {
+      const Eigen::Vector3d centroid = grasp_turn == 0 ? offset : Eigen::Vector3d(-offset);
+      pose.translation() = slots[request.tray_slot] - pose.linear() * centroid;
+      pose.translation().z() =
+          cell_.tray.floor_height + config_.release_height + hang + kinematics::kPadHeight / 2;
+    }
+    return poses;
+  };
+
+  struct Combination {
+    const Reached* grasp;
+    Reached slot;
+    Eigen::Vector2d slot_column;
+    double cost;
+  };
+  std::vector<Combination> combinations;
+  world_.set_gripper_gap(released);
+  for (const Reached& g : grasps) {
+    const auto poses = slot_poses(g.turn);
+    world_.set_columns({poses[0].translation().head<2>(), poses[1].translation().head<2>()});
+    for (const Reached& s : reach(world_, poses, grasp.width, rise, g.high, config_.carry, why)) {
+      const double cost = duration(start, g.high, config_.limits) +
+                          duration(g.high, s.high, config_.carry) +
+                          duration(s.high, cell_.observe_joints, config_.limits);
+      combinations.push_back({&g, s, poses[s.turn].translation().head<2>(), cost});
+    }
+  }
+  if (combinations.empty())
+    return finish(PickReason::kUnreachable,
+                  "tray slot " + std::to_string(request.tray_slot) + ": " + why);
+  std::sort(combinations.begin(), combinations.end(),
+            [](const auto& a, const auto& b) { return a.cost < b.cost; });
+
+  AttachedPart part;
+  part.a = part.b = Eigen::Vector3d(0, offset.y(), 0);
+  part.a.y() -= std::max(0.0, config_.held_length / 2 - config_.held_radius);
+  part.b.y() += std::max(0.0, config_.held_length / 2 - config_.held_radius);
+  part.radius = config_.held_radius;
+
+  const int tries = std::min<int>(kCombinations, static_cast<int>(combinations.size()));
+  for (int i = 0; i < tries; ++i) {
+    const Reached &g = *combinations[i].grasp, &s = combinations[i].slot;
+    const Eigen::Vector2d slot_column = combinations[i].slot_column;
+    const auto leg = [&](const JointPath& path, const JointLimits& limits) {
+      PathLeg result;
+      result.path = path;
+      result.limits = limits;
+      result.deviation = config_.corner_deviation;
+      return result;
+    };
+    const auto carried = [&](const JointPath& path, double speed) {
+      PathLeg result = leg(path, config_.carry);
+      result.max_tool_acceleration = config_.carry_tool_acceleration;
+      result.max_tool_speed = speed;
+      return result;
+    };
+
+    world_.set_attached(std::nullopt);
+    world_.set_gripper_gap(grasp.opening);
+    world_.set_columns({grasp_column});
+    const PlanResult to_grasp = motion::plan(world_, start, g.high, config_.planner);
+    if (!to_grasp.success) {
+      why = "way to the grasp: " + to_grasp.message;
+      continue;
+    }
+    PathLeg down = leg(reversed(g.up), config_.limits);
+    down.max_tool_speed = config_.approach_speed;
+    plan.approach = timed({leg(to_grasp.path, config_.limits), down}, why);
+    if (plan.approach.empty()) continue;
+
+    world_.set_gripper_gap(grasp.width);
+    AttachedPart held = part;  // in the TCP frame of this wrist turn
+    if (g.turn == 1) {
+      held.a.y() = -held.a.y();
+      held.b.y() = -held.b.y();
+    }
+    world_.set_attached(held);
+    world_.set_columns({grasp_column, slot_column});
+    const PlanResult to_slot = motion::plan(world_, g.high, s.high, config_.planner);
+    if (!to_slot.success) {
+      why = "way to the tray: " + to_slot.message;
+      continue;
+    }
+    const double unlimited = std::numeric_limits<double>::infinity();
+    plan.carry = timed({carried(g.up, config_.lift_speed), carried(to_slot.path, unlimited),
+                        carried(reversed(s.up), config_.approach_speed)}, why);
+    if (plan.carry.empty()) continue;
+
+    world_.set_attached(std::nullopt);
+    world_.set_gripper_gap(released);
+    world_.set_columns({slot_column});
+    const PlanResult home = motion::plan(world_, s.high, cell_.observe_joints, config_.planner);
+    if (!home.success) {
+      why = "way back: " + home.message;
+      continue;
+    }
+    plan.retreat = timed({leg(s.up, config_.limits), leg(home.path, config_.limits)}, why);
+    if (plan.retreat.empty()) continue;
+    return finish(PickReason::kSucceeded, "");
+  }
+  return finish(PickReason::kNoPlan, "grasp at " + millimetres(at) + ": " + why);
+}
+
+JointVector PickAndPlace::start_of(Robot& robot) const {
+  const JointVector q = robot.joints();
+  if (!q.allFinite()) throw Error("the robot reports joint angles that are not finite");
+  // Where the arm was sent to, so that its servo error does not become part of the next path.
+  for (const auto& there : {commanded_, std::optional<JointVector>(cell_.observe_joints)})
+    if (there && (q - *there).cwiseAbs().maxCoeff() < kSamePlace) return *there;
+  return q;
+}
+
+ExecutionResult PickAndPlace::move(Robot& robot, const Trajectory& trajectory) {
+  const ExecutionResult result = robot.execute(trajectory);
+  commanded_.reset();
+  if (result.success) commanded_ = trajectory.back().q;
+  return result;
+}
+
+PickResult PickAndPlace::observe(Robot& robot) {
+  const auto began = Clock::now();
+  const JointVector q = start_of(robot);
+  PickResult result;
+  if ((q - cell_.observe_joints).cwiseAbs().maxCoeff() < kAtRest) return result;
+  world_.set_attached(std::nullopt);
+  world_.set_gripper_gap(kinematics::max_gap());
+  world_.set_columns({});
+
+  // Out of contacts straight up first: the fingers may stand around a part.
+  PathLeg up, home;
+  up.path = {q};
+  if (world_.collides(q)) {
+    for (const double height : {0.05, 0.1, 0.15, 0.25}) {
+      const PlanResult rise = plan_straight(world_, q, raised(kinematics::forward(q), height), false);
+      if (!rise.success) continue;
+      up.path = rise.path;
+      if (!world_.collides(rise.path.back())) break;
+    }
+  }
+  const PlanResult way = motion::plan(world_, up.path.back(), cell_.observe_joints, config_.planner);
+  result.planning_seconds = seconds_since(began);
+  if (!way.success) {
+    result.reason = PickReason::kNoPlan;
+    result.message = "no way back to the observing pose: " + way.message +
+                     "; move the arm clear by hand and try again";
+    return result;
+  }
+  home.path = way.path;
+  up.limits = home.limits = config_.limits;
+  up.max_tool_speed = config_.lift_speed;
+  up.deviation = home.deviation = 0.0;
+  const ExecutionResult moved = move(robot, time_parametrize({up, home}));
+  if (!moved.success) {
+    result.reason = PickReason::kExecutionFailed;
+    result.message = "on the way to the observing pose: " + moved.message;
+  }
+  return result;
+}
+
+void PickAndPlace::put_back(Robot& robot, const PickPlan& plan, double opening) {
+  // From wherever the arm stopped back over the grasp, along what was planned for the way there.
+  const JointVector q = start_of(robot);
+  std::string why;
+  const auto nearest = std::min_element(
+      plan.carry.begin(), plan.carry.end(), [&](const TrajectoryPoint& a, const TrajectoryPoint& b) {
+        return (a.q - q).squaredNorm() < (b.q - q).squaredNorm();
+      });
+  PathLeg back;
+  back.path = {q};
+  for (auto it = std::make_reverse_iterator(nearest); it != plan.carry.rend(); ++it)
+    back.path.push_back(it->q);
+  back.limits = config_.carry;
+  back.max_tool_speed = config_.lift_speed;
+  back.max_tool_acceleration = config_.carry_tool_acceleration;
+  if ((*nearest).q.allFinite() && (nearest->q - q).cwiseAbs().maxCoeff() < 10 * kSamePlace)
+    move(robot, time_parametrize({back}));
+  robot.grip(opening, config_.grip_force);
+}
+
+PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
+                             const std::function<bool(const std::string&)>& phase) {
+  PickPlan plan;
+  PickResult result = plan_pick(start_of(robot), request, plan);
+  if (result.reason != PickReason::kSucceeded) return result;
+
+  // The failure with the arm brought home; what goes wrong on that way is added to the message.
+  const auto fail = [&](PickReason reason, const std::string& message) {
+    result.reason = reason;
+    result.message = message;
+    const PickResult home = observe(robot);
+    if (home.reason != PickReason::kSucceeded) result.message += "; " + home.message;
+    return result;
+  };
+  const auto begin = [&](const std::string& name) { return !phase || phase(name); };
+  const double opening = request.grasp.opening, force = config_.grip_force;
+  const auto held = [&](const GripResult& grip) { return grip.success && grip.gap >= config_.held_gap_min; };
+
+  if (!begin("approach")) return fail(PickReason::kExecutionFailed, "cancelled before the approach");
+  const GripResult opened = robot.preset(opening, force);
+  if (!opened.success)
+    return fail(PickReason::kExecutionFailed, "the gripper did not open: " + opened.message);
+  ExecutionResult moved = move(robot, plan.approach);
+  if (!moved.success) return fail(PickReason::kExecutionFailed, "approach: " + moved.message);
+
+  if (!begin("grasp")) return fail(PickReason::kExecutionFailed, "cancelled before the grasp");
+  GripResult grip = robot.grip(0.0, force);
+  const auto let_go = [&] { robot.grip(opening, force); };
+  if (!grip.success) {
+    let_go();
+    return fail(PickReason::kExecutionFailed, "the gripper did not close: " + grip.message);
+  }
+  if (!held(grip)) {
+    let_go();
+    return fail(PickReason::kMissed, "the gripper closed on nothing (gap " +
+                                         std::to_string(std::lround(grip.gap * 1e3)) + " mm)");
+  }
+
+  if (!begin("lift") || !begin("transfer")) {
+    let_go();
+    return fail(PickReason::kExecutionFailed, "cancelled before the lift");
+  }
+  const double gap = grip.gap;
+  moved = move(robot, plan.carry);
+  if (!moved.success) {
+    put_back(robot, plan, opening);
+    return fail(PickReason::kExecutionFailed, "transfer: " + moved.message);
+  }
+  grip = robot.grip(0.0, force);  // is it still there?
+  if (!held(grip)) {
+    let_go();
+    return fail(PickReason::kLost, "the part left the gripper on the way (gap " +
+                                       std::to_string(std::lround(gap * 1e3)) + " mm, now " +
+                                       std::to_string(std::lround(grip.gap * 1e3)) + " mm)");
+  }
+
+  begin("release");  // a cancelled pick sets the part down first
+  const GripResult released =
+      robot.grip(std::min(grip.gap + config_.release_margin, kinematics::max_gap()), force);
+  if (!released.success)
+    return fail(PickReason::kExecutionFailed, "the gripper did not let go: " + released.message);
+  begin("return");
+  moved = move(robot, plan.retreat);
+  if (!moved.success) return fail(PickReason::kExecutionFailed, "the part is in the tray; return: " + moved.message);
+  return result;
+}
+
+}  // namespace iwgnet_grasp::motion
