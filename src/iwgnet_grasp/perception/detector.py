@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -128,7 +129,11 @@ def _openvino_forward(model: YOLOv5s, size: tuple[int, int]) -> Forward:
 
     core = openvino.Core()
     example = torch.zeros(1, 3, *size, dtype=torch.uint8)
-    network = openvino.convert_model(_FromBytes(model), example_input=example, input=[1, 3, *size])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of torch's tracing, inside OpenVINO
+        network = openvino.convert_model(
+            _FromBytes(model), example_input=example, input=[1, 3, *size]
+        )
     # Latency: one look at a time; the plugin itself takes bfloat16 where the CPU has it.
     compiled = core.compile_model(network, "CPU", {"PERFORMANCE_HINT": "LATENCY"})
     request = compiled.create_infer_request()

@@ -69,7 +69,7 @@ class DetectorTrainingConfig:
     final_learning_rate: float = 2e-5
     warmup_steps: int = 100
     weight_decay: float = 5e-3
-    ema_decay: float = 0.998
+    ema_decay: float = 0.99
     loss: LossWeights = field(default_factory=LossWeights)
 
     @staticmethod
@@ -280,7 +280,10 @@ def fit(
             gradient_clip_val=10.0,
             num_sanity_val_steps=0,
             callbacks=[
-                EMAWeightAveraging(decay=config.ema_decay),
+                # Not from the first step: the average would long remember the random start.
+                EMAWeightAveraging(
+                    decay=config.ema_decay, update_starting_at_step=config.warmup_steps
+                ),
                 ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False),
             ],
             logger=lightning.pytorch.loggers.CSVLogger(run, name=None, version=""),

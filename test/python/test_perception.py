@@ -1,0 +1,366 @@
+"""Perception on one look: merged depth, object pixels, candidates, refusals of bad input."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwgnet_grasp.data.grasp_rectangle import Grasp
+from iwgnet_grasp.networks.yolov5s import YOLOv5s
+from iwgnet_grasp.perception import (
+    Box,
+    Detection,
+    GraspRectangle,
+    Perception,
+    PerceptionConfig,
+    PerceptionError,
+    load_perception,
+)
+from iwgnet_grasp.perception.detector import Detector, resolve_backend
+from iwgnet_grasp.perception.merged_depth import (
+    centroid,
+    crop_window,
+    grasp_depth,
+    merge,
+    metres,
+    object_mask,
+)
+from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, half_turn, select
+from iwgnet_grasp.training.detector import save_detector
+
+TABLE = 0.6  # m
+TOP = 0.58  # m, of the object
+BOX = Box(300, 200, 60, 40)
+
+
+def table(shape=(480, 640)) -> np.ndarray:
+    return np.full(shape, TABLE, np.float32)
+
+
+def scene() -> np.ndarray:
+    """An object that fills the middle half of BOX's columns."""
+    depth = table()
+    depth[200:240, 315:345] = TOP
+    return depth
+
+
+# Depth --------------------------------------------------------------------------------------------
+
+
+def test_metres_reads_both_encodings_of_the_camera():
+    millimetres = np.array([[600, 0], [580, 1]], np.uint16)
+    expected = np.array([[0.6, np.nan], [0.58, 0.001]], np.float32)
+    np.testing.assert_allclose(metres(millimetres), expected, rtol=1e-6)
+    metric = np.array([[0.6, -1.0], [np.inf, 0.0]], np.float32)
+    np.testing.assert_array_equal(metres(metric), np.float32([[0.6, np.nan], [np.nan, np.nan]]))
+
+
+@pytest.mark.parametrize(
+    ("depth", "complaint"),
+    [
+        (np.full((4, 4), np.nan, np.float32), "no pixel"),
+        (np.zeros((4, 4), np.uint16), "no pixel"),
+        (np.ones((4, 4), np.uint8), "uint8"),
+        (np.ones((4, 4, 3), np.float32), "shape"),
+        (np.ones((0, 4), np.float32), "shape"),
+    ],
+)
+def test_metres_refuses_what_is_no_depth_in_one_line(depth, complaint):
+    with pytest.raises(PerceptionError, match=complaint) as caught:
+        metres(depth)
+    assert "\n" not in str(caught.value)
+
+
+def test_metres_leaves_its_input_alone():
+    depth = np.array([[0.6, -1.0]], np.float32)
+    metres(depth)
+    assert depth[0, 1] == -1.0
+
+
+def test_merge_takes_the_box_from_the_scene_and_the_rest_from_the_empty_scene():
+    depth = scene()
+    depth[100, 100] = 0.5  # another object
+    depth[210, 320] = np.nan
+    merged = merge(depth, table(), BOX)
+    np.testing.assert_array_equal(merged[BOX.slices], depth[BOX.slices])
+    outside = np.ones(depth.shape, bool)
+    outside[BOX.slices] = False
+    assert np.all(merged[outside] == np.float32(TABLE))
+
+
+def test_window_is_centred_on_the_box_at_native_resolution():
+    depth = scene()
+    window = crop_window(depth, table(), BOX, 224)
+    rows, columns = (slice(window.y, window.y + 224), slice(window.x, window.x + 224))
+    assert window.depth.shape == window.empty.shape == (224, 224)
+    np.testing.assert_array_equal(window.depth, merge(depth, table(), BOX)[rows, columns])
+    u, v = BOX.center
+    assert abs(window.x + 111.5 - u) <= 0.5
+    assert abs(window.y + 111.5 - v) <= 0.5
+
+
+@given(
+    x=st.integers(0, 600),
+    y=st.integers(0, 440),
+    width=st.integers(1, 640),
+    height=st.integers(1, 480),
+)
+def test_window_never_leaves_the_image(x, y, width, height):
+    box = Box(x, y, min(width, 640 - x), min(height, 480 - y))
+    depth = np.random.default_rng(0).uniform(0.5, 0.6, (480, 640)).astype(np.float32)
+    window = crop_window(depth, table(), box, 224)
+    assert 0 <= window.x <= 640 - 224
+    assert 0 <= window.y <= 480 - 224
+    expected = merge(depth, table(), box)[window.y : window.y + 224, window.x : window.x + 224]
+    np.testing.assert_array_equal(window.depth, expected)
+
+
+def test_window_larger_than_the_image_is_refused():
+    with pytest.raises(PerceptionError, match="window of 224 px"):
+        crop_window(table((100, 300)), table((100, 300)), Box(10, 10, 5, 5), 224)
+
+
+# Pixels of the object -----------------------------------------------------------------------------
+
+
+def test_object_pixels_are_those_nearer_than_the_empty_scene():
+    depth = scene()
+    depth[200, 315:345] = np.nan  # not measured
+    mask = object_mask(depth, table(), BOX, 0.004)
+    assert mask.shape == (40, 60)
+    assert mask.sum() == 39 * 30
+    assert not mask[0].any()
+
+
+def test_object_pixels_where_the_empty_scene_has_a_hole():
+    empty = table()
+    empty[200:240, 320:330] = np.nan
+    assert object_mask(scene(), empty, BOX, 0.004).sum() == 40 * 30
+    empty[:] = np.nan
+    assert object_mask(scene(), empty, BOX, 0.004).sum() == 0
+
+
+def test_centroid_is_the_mean_pixel():
+    mask = np.zeros((40, 60), bool)
+    mask[10, 20] = mask[12, 20] = mask[11, 26] = True
+    u, v, pixels = centroid(mask, BOX)
+    assert (u, v, pixels) == (300 + 22, 200 + 11, 3)
+
+
+def test_centroid_of_nothing():
+    u, v, pixels = centroid(np.zeros((40, 60), bool), BOX)
+    assert math.isnan(u) and math.isnan(v) and pixels == 0
+
+
+def test_grasp_depth_is_the_surface_not_the_bore():
+    depth = scene()
+    depth[215:225, 325:335] = TABLE  # a bore seen through to the table
+    mask = object_mask(depth, table(), BOX, 0.004)
+    over_bore = GraspRectangle(330, 220, 0.0, 30.0, 0.9)
+    assert grasp_depth(depth, mask, BOX, over_bore, 3.0) == pytest.approx(TOP)
+    on_top = GraspRectangle(320, 220, 0.0, 30.0, 0.9)
+    assert grasp_depth(depth, mask, BOX, on_top, 3.0) == pytest.approx(TOP)
+    beside = GraspRectangle(305, 220, math.pi / 2, 10.0, 0.9)
+    assert math.isnan(grasp_depth(depth, mask, BOX, beside, 3.0))
+
+
+# Candidates ---------------------------------------------------------------------------------------
+
+
+def test_half_turn_is_periodic():
+    assert half_turn(math.pi / 2) == pytest.approx(math.pi / 2)
+    assert half_turn(-math.pi / 2) == pytest.approx(math.pi / 2)
+    assert half_turn(0.3 + 5 * math.pi) == pytest.approx(0.3)
+
+
+def at(x: float, y: float, theta: float, quality: float) -> GraspRectangle:
+    return GraspRectangle(x, y, theta, 30.0, quality)
+
+
+DETECTION = Detection("connecting_rod", 0.9, BOX)
+
+
+def test_candidates_are_distinct_in_place_or_direction():
+    best = at(330, 220, math.radians(85), 0.9)
+    repeat = at(335, 220, math.radians(-85), 0.8)  # 10 deg apart across the wrap
+    turned = at(335, 220, math.radians(30), 0.7)
+    moved = at(345, 220, math.radians(85), 0.6)
+    kept = select([moved, repeat, turned, best], DETECTION, 8, 12.0, math.radians(20))
+    assert kept == [best, turned, moved]
+
+
+def test_candidates_lie_in_the_box_and_are_limited():
+    outside = at(299.4, 220, 0.0, 0.99)
+    row = [at(300 + 14 * i, 220, 0.0, 0.5 + 0.1 * i) for i in range(4)]
+    kept = select([outside, *row], DETECTION, 3, 12.0, math.radians(20))
+    assert [g.quality for g in kept] == pytest.approx([0.8, 0.7, 0.6])
+
+
+# The whole look -----------------------------------------------------------------------------------
+
+
+class KnownBoxes:
+    """A detector that knows where the objects are."""
+
+    def __init__(self, *boxes: Box) -> None:
+        self.boxes = boxes
+
+    def detect(self, color: np.ndarray) -> list[Detection]:
+        return [Detection("connecting_rod", 0.9, box) for box in self.boxes]
+
+
+class HighestPoint:
+    """An estimator that grasps each window's object pixels at their middle."""
+
+    input_px = 224
+
+    def predict(self, depth: np.ndarray, empty: np.ndarray) -> list[list[Grasp]]:
+        found = []
+        for d, e in zip(depth, empty, strict=True):
+            rows, columns = np.nonzero(e - d > 0.004)
+            found.append([Grasp(columns.mean(), rows.mean(), 0.2, 25.0, 0.7)] if len(rows) else [])
+        return found
+
+
+@pytest.fixture
+def config() -> PerceptionConfig:
+    return PerceptionConfig.load()
+
+
+def color(shape=(480, 640)) -> np.ndarray:
+    return np.full((*shape, 3), 128, np.uint8)
+
+
+def test_a_look_gives_grasps_in_pixels_of_the_full_image(config):
+    perception = Perception(config, KnownBoxes(BOX, Box(10, 10, 40, 40)), HighestPoint())
+    look = perception.look(color(), scene(), table())
+    first, second = look.objects
+    assert (first.object_id, second.object_id) == (0, 1)
+    assert first.valid_pixels == 40 * 30
+    assert (first.centroid_u_px, first.centroid_v_px) == pytest.approx((329.5, 219.5))
+    assert first.centroid_depth_m == pytest.approx(TOP)
+    (grasp,) = first.grasps
+    assert (grasp.x_px, grasp.y_px) == pytest.approx((329.5, 219.5))
+    assert (grasp.theta_rad, grasp.width_px, grasp.quality) == pytest.approx((0.2, 25.0, 0.7))
+    assert grasp.depth_m == pytest.approx(TOP)
+    assert second.valid_pixels == 0 and second.grasps == ()
+    assert math.isnan(second.centroid_depth_m)
+
+
+def test_an_empty_table_is_no_error(config):
+    look = Perception(config, KnownBoxes(), HighestPoint()).look(color(), table(), table())
+    assert look.objects == () and look.windows == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"color": np.zeros((480, 640), np.uint8)}, "color: shape"),
+        ({"color": np.zeros((480, 640, 3), np.float32)}, "color: type"),
+        ({"depth": np.full((480, 640), np.nan, np.float32)}, "depth: no pixel"),
+        ({"depth": np.full((240, 320), 0.6, np.float32)}, "depth: 320x240 px differs"),
+        ({"empty_depth": np.zeros((480, 640), np.float32)}, "empty_depth: no pixel"),
+        ({"empty_depth": np.full((480, 640), 1, np.int32)}, "empty_depth: type"),
+    ],
+)
+def test_bad_images_are_refused_by_name(config, change, complaint):
+    perception = Perception(config, KnownBoxes(BOX), HighestPoint())
+    images = {"color": color(), "depth": scene(), "empty_depth": table()} | change
+    with pytest.raises(PerceptionError, match=complaint) as caught:
+        perception.look(**images)
+    assert "\n" not in str(caught.value)
+
+
+# Detector -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(3)
+    folder = tmp_path_factory.mktemp("models")
+    return save_detector(YOLOv5s(1), folder / "random.safetensors", (96, 160), ["rod"], {})
+
+
+def test_backends_see_the_same(weights):
+    image = np.random.default_rng(0).integers(0, 255, (200, 320, 3), dtype=np.uint8)
+    maps = {}
+    for backend in ("torch", "openvino"):
+        detector = Detector(weights, backend=backend, score_threshold=0.0)
+        pixels = torch.from_numpy(image[:96, :160].transpose(2, 0, 1).copy())[None]
+        maps[backend] = [m.clone() for m in detector._forward(pixels)]
+    for ours, theirs in zip(maps["torch"], maps["openvino"], strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0.05, atol=0.05)
+
+
+def test_boxes_stay_inside_the_image_and_are_sorted(weights):
+    image = np.random.default_rng(1).integers(0, 255, (250, 320, 3), dtype=np.uint8)
+    found = Detector(weights, backend="torch", score_threshold=0.0).detect(image)
+    assert 0 < len(found) <= 30
+    assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
+    for d in found:
+        assert d.label == "rod"
+        assert 0 <= d.box.x < d.box.x + d.box.width <= 320
+        assert 0 <= d.box.y < d.box.y + d.box.height <= 250
+
+
+def test_a_missing_weight_file_says_how_to_make_it(tmp_path):
+    with pytest.raises(PerceptionError, match="train"):
+        Detector(tmp_path / "none.safetensors")
+
+
+def test_a_broken_weight_file_is_one_line(weights, tmp_path):
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(weights.read_bytes()[:1000])
+    broken.with_suffix(".json").write_text(weights.with_suffix(".json").read_text())
+    with pytest.raises(PerceptionError, match="broken.safetensors") as caught:
+        Detector(broken)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_card_of_another_network_is_refused(weights, tmp_path):
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(weights.read_bytes())
+    other.with_suffix(".json").write_text(json.dumps({"network": "iwgnet", "input_px": 224}))
+    with pytest.raises(PerceptionError, match="other.json"):
+        Detector(other)
+
+
+def test_unknown_backend_is_refused():
+    with pytest.raises(PerceptionError, match="tensorrt"):
+        resolve_backend("tensorrt")
+
+
+# Config -------------------------------------------------------------------------------------------
+
+
+def test_config_of_the_package_names_its_weights(config):
+    assert config.detector_weights.name == "yolov5s.safetensors"
+    assert config.min_angle_rad == pytest.approx(math.radians(20))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("detector: [", "not a valid"),
+        ("detector: {weights: a}", "missing"),
+        ("", "not a valid"),
+        ("42", "not a valid"),
+    ],
+)
+def test_malformed_config_is_one_line_with_the_file(tmp_path, text, complaint):
+    path = tmp_path / "perception.yaml"
+    path.write_text(text)
+    with pytest.raises(PerceptionError, match=complaint) as caught:
+        PerceptionConfig.load(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_perception_without_weights_says_so(tmp_path):
+    path = tmp_path / "perception.yaml"
+    path.write_text(DEFAULT_CONFIG.read_text().replace("models/", f"{tmp_path}/"))
+    with pytest.raises(PerceptionError, match="yolov5s.safetensors"):
+        load_perception(path)
