@@ -1,0 +1,195 @@
+// Ray-traced images against analytic geometry and photometry.
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <cstring>
+
+#include "iwgnet_grasp/sensing/pinhole.h"
+#include "iwgnet_grasp/sensing/renderer.h"
+
+namespace iwgnet_grasp::sensing {
+namespace {
+
+const PinholeIntrinsics kCamera{322, 241, 200, 200, 160.5, 120.0};  // sizes no multiple of a tile
+
+Pose at(double x, double y, double z) { return Pose(Eigen::Translation3d(x, y, z)); }
+
+TriangleMesh sphere(double radius, int rings) {
+  TriangleMesh mesh;
+  for (int i = 0; i <= rings; ++i)
+    for (int j = 0; j < 2 * rings; ++j) {
+      const double a = M_PI * i / rings, b = M_PI * j / rings;
+      mesh.vertices.emplace_back(radius * std::sin(a) * std::cos(b),
+                                 radius * std::sin(a) * std::sin(b), radius * std::cos(a));
+    }
+  const auto index = [&](int i, int j) { return static_cast<std::uint32_t>(i * 2 * rings + j % (2 * rings)); };
+  for (int i = 0; i < rings; ++i)
+    for (int j = 0; j < 2 * rings; ++j) {
+      mesh.triangles.push_back({index(i, j), index(i + 1, j), index(i + 1, j + 1)});
+      mesh.triangles.push_back({index(i, j), index(i + 1, j + 1), index(i, j + 1)});
+    }
+  return mesh;
+}
+
+TEST(Depth, PlaneIsExact) {
+  Renderer renderer;
+  renderer.add_instance(renderer.add_box({4, 4, 0.2}), {}, at(0, 0, 1.1));
+  const cv::Mat depth = renderer.depth(kCamera, Pose::Identity());
+  ASSERT_EQ(depth.size(), cv::Size(kCamera.width, kCamera.height));
+  double low, high;
+  cv::minMaxLoc(depth, &low, &high);
+  EXPECT_NEAR(low, 1.0, 1e-6);
+  EXPECT_NEAR(high, 1.0, 1e-6);
+}
+
+TEST(Depth, SphereMatchesTheQuadratic) {
+  Renderer renderer;
+  const double radius = 0.3, distance = 1.0;
+  renderer.add_instance(renderer.add_mesh(sphere(radius, 200)), {}, at(0, 0, distance));
+  const cv::Mat depth = renderer.depth(kCamera, Pose::Identity());
+  int hits = 0;
+  for (int v = 0; v < depth.rows; ++v)
+    for (int u = 0; u < depth.cols; ++u) {
+      // |t d - c|^2 = r^2 with d = (x, y, 1)
+      const Eigen::Vector3d d = deproject(kCamera, u, v, 1.0);
+      const double discriminant = distance * distance - d.squaredNorm() * (distance * distance - radius * radius);
+      if (discriminant > 0.01) {
+        ++hits;
+        const double t = (distance - std::sqrt(discriminant)) / d.squaredNorm();
+        ASSERT_NEAR(depth.at<float>(v, u), t, 2e-4) << u << ", " << v;
+      } else if (discriminant < -0.01) {
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u)));
+      }
+    }
+  EXPECT_GT(hits, 5000);
+}
+
+TEST(Depth, FollowsCameraAndInstancePoses) {
+  Renderer renderer;
+  const int box = renderer.add_instance(renderer.add_box({0.2, 0.2, 0.2}), {}, at(0.5, 0.1, 0.1));
+  Pose T_base_camera = at(0.5, 0.1, 1.0);
+  T_base_camera.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
+  const auto center = [&] { return renderer.depth(kCamera, T_base_camera).at<float>(120, 160); };
+  EXPECT_NEAR(center(), 0.8, 1e-6);
+  renderer.set_pose(box, at(0.5, 0.1, 0.3));
+  EXPECT_NEAR(center(), 0.6, 1e-6);
+  renderer.set_visible(box, false);
+  EXPECT_TRUE(std::isnan(center()));
+  renderer.set_visible(box, true);
+  EXPECT_NEAR(center(), 0.6, 1e-6);
+}
+
+TEST(Instances, NameWhatEachPixelShows) {
+  Renderer renderer;
+  const int box = renderer.add_box({0.2, 0.2, 0.02});
+  const int left = renderer.add_instance(box, {}, at(-0.2, 0, 1));
+  const int right = renderer.add_instance(box, {}, at(0.2, 0, 1));
+  const cv::Mat ids = renderer.instances(kCamera, Pose::Identity());
+  const auto seen = [&](double x) {
+    return ids.at<int>(120, cvRound(kCamera.cx + kCamera.fx * x / 0.99));
+  };
+  EXPECT_EQ(seen(-0.2), left);
+  EXPECT_EQ(seen(0.2), right);
+  EXPECT_EQ(seen(0.0), -1);
+  renderer.clear_instances();
+  EXPECT_EQ(cv::countNonZero(renderer.instances(kCamera, Pose::Identity()) != -1), 0);
+  EXPECT_EQ(renderer.add_instance(box, {}, at(0, 0, 1)), 0);  // meshes stay
+  EXPECT_EQ(renderer.instances(kCamera, Pose::Identity()).at<int>(120, 160), 0);
+}
+
+// A matt grey floor seen from above, lit by a small lamp beside the camera.
+struct Scene {
+  Renderer renderer;
+  Light light;
+  Pose T_base_camera = at(0, 0, 1);
+  Scene() {
+    T_base_camera.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
+    renderer.add_instance(renderer.add_box({4, 4, 0.1}), {{0.3f, 0.3f, 0.3f}, 0, 1, 0}, at(0, 0, -0.05));
+    light.position = {0.8f, 0, 1};
+    light.ambient = 0.2f;
+    light.radius = 0.05f;
+  }
+  double brightness(double x, double y) {
+    const cv::Mat image = renderer.color(kCamera, T_base_camera, light, 0, 0);
+    const int u = cvRound(kCamera.cx + kCamera.fx * x), v = cvRound(kCamera.cy - kCamera.fy * y);
+    return cv::mean(image(cv::Rect(u - 1, v - 1, 3, 3)))[1];
+  }
+};
+
+TEST(Color, BlockerCastsItsShadowWhereTheRayFromTheLampFalls) {
+  Scene scene;
+  const double before = scene.brightness(-0.2, 0);
+  // A plate 0.2 m above the floor between lamp and (-0.2, 0): the ray passes x = 0 at z = 0.2.
+  scene.renderer.add_instance(scene.renderer.add_box({0.1, 0.1, 0.01}), {}, at(0.0, 0, 0.2));
+  EXPECT_LT(scene.brightness(-0.2, 0), 0.75 * before);
+  EXPECT_NEAR(scene.brightness(-0.2, 0.3), before, 0.15 * before);  // beside the shadow
+  EXPECT_GT(scene.brightness(-0.2, 0), 0);                           // ambient light remains
+}
+
+TEST(Color, PenumbraGrowsWithTheLamp) {
+  const auto penumbra = [](float radius) {
+    Scene scene;
+    scene.light.radius = radius;
+    scene.renderer.add_instance(scene.renderer.add_box({0.1, 0.6, 0.01}), {}, at(0.0, 0, 0.2));
+    const cv::Mat image = scene.renderer.color(kCamera, scene.T_base_camera, scene.light, 0, 0);
+    double low = 255, high = 0;
+    const auto value = [&](int u) { return image.at<cv::Vec3b>(120, u)[1]; };
+    const int from = cvRound(kCamera.cx - kCamera.fx * 0.34), to = cvRound(kCamera.cx - kCamera.fx * 0.19);
+    for (int u = from; u < to; ++u) {
+      low = std::min<double>(low, value(u));
+      high = std::max<double>(high, value(u));
+    }
+    int width = 0;
+    for (int u = from; u < to; ++u)
+      width += value(u) > low + 0.15 * (high - low) && value(u) < high - 0.15 * (high - low);
+    return width;
+  };
+  EXPECT_LE(penumbra(0.0f), 4);  // the filter's four pixels
+  EXPECT_GT(penumbra(0.15f), penumbra(0.0f) + 4);
+}
+
+TEST(Color, NoiseHasTheAskedDeviationAndComesFromTheSeed) {
+  Scene scene;
+  const auto shot = [&](double sigma, std::uint64_t seed) {
+    return scene.renderer.color(kCamera, scene.T_base_camera, scene.light, sigma, seed);
+  };
+  const cv::Mat clean = shot(0, 1), noisy = shot(4, 1);
+  cv::Mat difference;
+  cv::subtract(noisy, clean, difference, cv::noArray(), CV_32FC3);
+  cv::Scalar mean, deviation;
+  cv::meanStdDev(difference, mean, deviation);
+  for (int c = 0; c < 3; ++c) {
+    EXPECT_NEAR(mean[c], 0, 0.1);
+    EXPECT_NEAR(deviation[c], 4, 0.15);
+  }
+  const cv::Mat again = shot(4, 1), other = shot(4, 2);
+  EXPECT_EQ(std::memcmp(again.data, noisy.data, noisy.total() * 3), 0);
+  EXPECT_NE(std::memcmp(other.data, noisy.data, noisy.total() * 3), 0);
+}
+
+TEST(Color, AlbedoAndHueReachTheImage) {
+  Scene scene;
+  const int box = scene.renderer.add_instance(scene.renderer.add_box({0.3, 0.3, 0.01}), {}, at(0, 0, 0.005));
+  scene.renderer.set_material(box, {{0.6f, 0.1f, 0.05f}, 0, 1, 0});
+  const cv::Vec3b red = scene.renderer.color(kCamera, scene.T_base_camera, scene.light, 0, 0).at<cv::Vec3b>(120, 160);
+  EXPECT_GT(red[0], 1.5 * red[1]);  // RGB order
+  EXPECT_GT(red[1], red[2]);
+  scene.renderer.set_material(box, {{0.02f, 0.02f, 0.02f}, 0, 1, 0});
+  const cv::Vec3b dark = scene.renderer.color(kCamera, scene.T_base_camera, scene.light, 0, 0).at<cv::Vec3b>(120, 160);
+  EXPECT_LT(dark[0], 0.5 * red[0]);
+}
+
+TEST(Renderer, BadInputIsRefused) {
+  Renderer renderer;
+  EXPECT_THROW(renderer.add_mesh({}), Error);
+  TriangleMesh broken;
+  broken.vertices.resize(3);
+  broken.triangles.push_back({0, 1, 7});
+  EXPECT_THROW(renderer.add_mesh(broken), Error);
+  EXPECT_THROW(renderer.add_instance(0, {}, Pose::Identity()), Error);
+  EXPECT_THROW(renderer.set_pose(3, Pose::Identity()), Error);
+  EXPECT_THROW(renderer.depth({}, Pose::Identity()), Error);
+}
+
+}  // namespace
+}  // namespace iwgnet_grasp::sensing
