@@ -86,7 +86,7 @@ def load_detection_set(
 ) -> DetectionSet:
     """Reads FOLDER/detector/{annotations.json, images/*.png}; images letterboxed to `size`.
 
-    folder: a data set made by 'iwgnet generate' (or its detector folder). limit: at most that many
+    folder: a data set made by 'iwgnet dataset' (or its detector folder). limit: at most that many
     scenes. Boxes of COCO [x, y, width, height]; crowd regions are left out. Classes are ordered by
     category id. Raises DataError.
     """
@@ -107,9 +107,7 @@ def load_detection_set(
         images = sorted(text["images"], key=lambda i: i["file_name"])[:limit]
         files = [(i["id"], root / "images" / Path(i["file_name"]).name) for i in images]
     except FileNotFoundError:
-        raise DataError(
-            f"{path}: no such file; make data with 'iwgnet generate'"
-        ) from None
+        raise DataError(f"{path}: no such file; make data with 'iwgnet dataset'") from None
     except (OSError, KeyError, TypeError, ValueError) as error:
         line = " ".join(str(error).split())
         raise DataError(f"{path}: not COCO annotations ({line})") from None

@@ -36,7 +36,7 @@ class Detector:
         weights = Path(weights)
         if not weights.is_file():
             raise PerceptionError(
-                f"{weights}: no such weight file; train the detector with 'iwgnet train-detector'"
+                f"{weights}: no such weight file; train the detector with 'iwgnet train detector'"
             )
         try:
             card = read_card(weights)

@@ -1,4 +1,4 @@
-"""Training of YOLOv5s on a data set of the simulator: `iwgnet train-detector`."""
+"""Training of YOLOv5s on a data set of the simulator: `iwgnet train detector`."""
 
 from __future__ import annotations
 
@@ -317,7 +317,9 @@ def save_detector(
 
 
 def train_detector(
-    data: Annotated[Path, typer.Argument(help="Data set folder made by 'iwgnet generate'.")],
+    data: Annotated[Path, typer.Option(help="Folder made by 'iwgnet dataset'.")] = Path(
+        "data/train"
+    ),
     output: Annotated[Path, typer.Option(help="Weight file to write.")] = PACKAGE
     / "models"
     / "yolov5s.safetensors",
