@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ app = typer.Typer(
     name="iwgnet",
     help="Data, training and evaluation of the grasp networks and of the detector.",
     no_args_is_help=True,
+    add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
@@ -98,17 +100,41 @@ def train(
     typer.echo(f"wrote {weights} and {weights.with_suffix('.json')}")
 
 
+_FORWARD = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
+
+
+def _forward(context: typer.Context, command: Callable[..., None], name: str) -> None:
+    """Runs a command of another module, with its own options and help."""
+    inner = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
+    inner.command()(command)
+    inner(args=context.args, prog_name=f"iwgnet {name}")
+
+
+@train_app.command("detector", context_settings=_FORWARD)
+def train_detector(context: typer.Context) -> None:
+    """Train the object detector (YOLOv5s); options: iwgnet train detector --help."""
+    from iwgnet_grasp.training import detector
+
+    _forward(context, detector.train_detector, "train detector")
+
+
+@app.command("dataset", context_settings=_FORWARD)
+def dataset(context: typer.Context) -> None:
+    """Make a labelled data set with the simulator; options: iwgnet dataset --help."""
+    from iwgnet_grasp.data import generate
+
+    _forward(context, generate.generate, "dataset")
+
+
 def main() -> None:
     """Entry point: errors that a user can mend end in one line, not in a traceback."""
     from iwgnet_grasp.data.errors import DataError
     from iwgnet_grasp.networks.weights import WeightsError
 
     logging.basicConfig(format="%(levelname)s %(message)s")
-    for chatty in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(chatty).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", module="lightning")
+    warnings.filterwarnings("ignore", module="lightning|torch")
     try:
-        app()
+        app(prog_name="iwgnet")
     except (DataError, WeightsError, ValueError) as error:
         typer.echo(f"error: {error}", err=True)
         raise SystemExit(2) from None

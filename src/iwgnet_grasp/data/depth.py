@@ -58,7 +58,7 @@ def fill_holes(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     missing = ~valid
     window = 5
     sums, counts = filled.copy(), weight.copy()
-    while missing.any() and window < 2 * max(values.shape):
+    while missing.any() and window <= max(values.shape):
         blur = (window, window)
         mean_weight = cv2.blur(counts, blur, borderType=cv2.BORDER_CONSTANT)
         mean_value = cv2.blur(sums, blur, borderType=cv2.BORDER_CONSTANT)
@@ -66,6 +66,8 @@ def fill_holes(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
         filled[found] = mean_value[found] / mean_weight[found]
         missing &= ~found
         window = 4 * window + 1
+    if missing.any() and valid.any():  # nothing valid within half the image
+        filled[missing] = values[valid].mean()
     return filled
 
 

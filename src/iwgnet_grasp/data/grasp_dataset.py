@@ -108,18 +108,20 @@ class GraspDataset(Dataset):
     """Crops of `input_px` with their label maps.
 
     An item: heights [1, S, S] and labels [5, S, S] (q, cos, sin, width, mask), float32. With an
-    augmentation each epoch draws anew from (seed, epoch, index), so that a resumed run sees what
-    the whole run would have seen; without one the crop is the view's centre.
+    augmentation the crop is a function of (seed, index) alone; without one it is the view's centre.
     """
 
     def __init__(
-        self, views: Views, input_px: int, augmentation: Augmentation | None = None, seed: int = 0
+        self,
+        views: Views,
+        input_px: int,
+        augmentation: Augmentation | None = None,
+        seed: tuple[int, ...] = (0,),
     ) -> None:
         self.views = views
         self.input_px = input_px
         self.augmentation = augmentation
         self.seed = seed
-        self.epoch = 0
 
     def __len__(self) -> int:
         return len(self.views)
@@ -130,7 +132,7 @@ class GraspDataset(Dataset):
         rectangles = self.views.rectangles[index]
         if self.augmentation is None:
             return centre_crop(height, rectangles, self.input_px)
-        rng = np.random.default_rng((self.seed, self.epoch, index))
+        rng = np.random.default_rng((*self.seed, index))
         return self.augmentation(height, rectangles, self.input_px, rng)
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:

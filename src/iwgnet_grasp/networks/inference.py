@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from iwgnet_grasp.data.depth import normalise_depth
+from iwgnet_grasp.data.depth import normalise_depth, valid_depth
 from iwgnet_grasp.data.grasp_rectangle import Grasp
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.grasp_network import GraspNetwork
@@ -52,6 +52,7 @@ class GraspEstimator:
         for i, image in enumerate(depth):
             try:
                 heights[i] = normalise_depth(image, None if empty is None else empty[i])
+                usable[i] = valid_depth(image).any()
             except ValueError:
                 usable[i] = False
         maps = self._predict(heights)

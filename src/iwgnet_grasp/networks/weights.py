@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save
 from torch import nn
 
 from iwgnet_grasp.networks import create_network
-from iwgnet_grasp.networks.grasp_network import GraspNetwork
+from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX, GraspNetwork
 
 MODELS = Path(__file__).resolve().parents[3] / "models"
 
@@ -105,6 +105,14 @@ def load_weights(name_or_path: str | Path) -> tuple[GraspNetwork, dict[str, Any]
         network = create_network(str(card["network"]))
     except ValueError as error:
         raise WeightsError(f"{path.with_suffix('.json')}: {error}") from None
+    if not isinstance(card.get("input_px"), int) or card["input_px"] <= 0:
+        raise WeightsError(f"{path.with_suffix('.json')}: entry 'input_px' is missing or no size")
+    reference = card.get("width_reference_px", WIDTH_REFERENCE_PX)
+    if reference != WIDTH_REFERENCE_PX:
+        raise WeightsError(
+            f"{path.with_suffix('.json')}: widths are in units of {reference} px, this version "
+            f"reads {WIDTH_REFERENCE_PX:g} px; train again"
+        )
     load_state(network, path, str(card["network"]))
     return network.eval(), card
 

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.depth import HEIGHT_CLIP, HEIGHT_UNIT
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.data.grasp_dataset import VIEW_PX, GraspDataset, find_samples, load_views
+from iwgnet_grasp.data.grasp_dataset import VIEW_PX, GraspDataset, Views, find_samples, load_views
 from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
@@ -61,11 +61,36 @@ class TrainingResources:
 class GraspTraining(lightning.LightningModule):
     """AdamW with a one-cycle schedule on `grasp_loss`, validated by the top-1 rectangle metric."""
 
-    def __init__(self, settings: GraspTrainingSettings) -> None:
+    def __init__(
+        self, settings: GraspTrainingSettings, training: Views, validation: Views, workers: int = 0
+    ) -> None:
         super().__init__()
         self.settings = settings
+        self.views = training
+        self.validation_set = GraspDataset(validation, settings.input_px)
+        self.workers = workers
         network = create_network(settings.network)
         self.network = network.to(memory_format=torch.channels_last)
+
+    def train_dataloader(self) -> DataLoader:
+        """Made anew each epoch: order and augmentation depend on seed and epoch alone, so that a
+        resumed run sees what the whole run would have seen."""
+        settings, epoch = self.settings, self.current_epoch
+        dataset = GraspDataset(
+            self.views, settings.input_px, Augmentation(), seed=(settings.seed, epoch)
+        )
+        # A list and not shuffle=True: a loader may be iterated more than once after a resume.
+        order = np.random.default_rng((settings.seed, epoch)).permutation(len(dataset)).tolist()
+        return DataLoader(
+            dataset,
+            min(settings.batch, len(dataset)),
+            sampler=order,
+            drop_last=True,
+            num_workers=self.workers,
+        )
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(self.validation_set, self.settings.batch)
 
     def training_step(self, batch: tuple[torch.Tensor, torch.Tensor], _: int) -> torch.Tensor:
         loss = self._loss(batch)
@@ -76,7 +101,7 @@ class GraspTraining(lightning.LightningModule):
 
     def validation_step(self, batch: tuple[torch.Tensor, torch.Tensor], index: int) -> None:
         loss = self._loss(batch)
-        dataset = self.trainer.val_dataloaders.dataset
+        dataset = self.validation_set
         maps = self.network(batch[0].to(memory_format=torch.channels_last))
         predictions = torch.stack(list(maps), dim=1).float().cpu().numpy()
         # The loader neither shuffles nor drops: item i of the batch is item start + i of the set,
@@ -114,16 +139,6 @@ class GraspTraining(lightning.LightningModule):
             pct_start=settings.warm_up,
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-
-class _Epoch(Callback):
-    """Tells the data set the epoch, also after a resume, so that the augmentation moves on."""
-
-    def __init__(self, dataset: GraspDataset) -> None:
-        self.dataset = dataset
-
-    def on_train_epoch_start(self, trainer: lightning.Trainer, module: GraspTraining) -> None:
-        self.dataset.epoch = trainer.current_epoch
 
 
 class _Weights(Callback):
@@ -176,6 +191,8 @@ def train_grasp_network(
     if settings.split not in SPLITS:
         raise ValueError(f"no split '{settings.split}'; known: {', '.join(SPLITS)}")
     create_network(settings.network)
+    for chatty in ("lightning.pytorch", "lightning.fabric", "lightning"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
     if resources.threads:
         torch.set_num_threads(resources.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
@@ -189,29 +206,15 @@ def train_grasp_network(
         training, held_out = split(samples, settings.validation, settings.seed)
     if not training or not held_out:
         raise DataError(f"{data}: {len(samples)} samples are too few to train and to validate on")
-    train_set = GraspDataset(
-        load_views(training), settings.input_px, Augmentation(), seed=settings.seed
-    )
-    validation_set = GraspDataset(load_views(held_out), settings.input_px)
-    batch = min(settings.batch, len(train_set))
-    train_loader = DataLoader(
-        train_set,
-        batch,
-        shuffle=True,
-        drop_last=True,
-        num_workers=resources.workers,
-        generator=torch.Generator().manual_seed(settings.seed),
-    )
-    validation_loader = DataLoader(validation_set, settings.batch)
+    views, held_out_views = load_views(training), load_views(held_out)
+    module = GraspTraining(settings, views, held_out_views, resources.workers)
 
     folder = log_dir / settings.network
-    module = GraspTraining(settings)
     weights = out / f"{settings.network}.safetensors"
-    card = _card(settings, module, data, len(train_set), validation_data, len(validation_set))
-    checkpoint = ModelCheckpoint(
-        dirpath=folder, filename="best", monitor="val/top1", mode="max", save_last=True
-    )
-    callbacks = [_Epoch(train_set), _Weights(weights, card), checkpoint]
+    card = _card(settings, module, data, len(views), validation_data, len(held_out_views))
+    # Rewritten each epoch; the best weights are kept by _Weights.
+    checkpoint = ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False)
+    callbacks: list[Callback] = [_Weights(weights, card), checkpoint]
     if settings.patience:
         callbacks.append(EarlyStopping("val/top1", mode="max", patience=settings.patience))
     if progress:
@@ -229,15 +232,14 @@ def train_grasp_network(
         enable_progress_bar=progress,
         enable_model_summary=False,
         num_sanity_val_steps=0,
-        log_every_n_steps=10,
+        log_every_n_steps=5,
+        reload_dataloaders_every_n_epochs=1,
     )
     last = folder / "last.ckpt"
     if resume and not last.is_file():
         raise DataError(f"{last}: no checkpoint to resume from; train without --resume")
     trainer.fit(
         module,
-        train_loader,
-        validation_loader,
         ckpt_path=last if resume else None,
         weights_only=True,
     )
