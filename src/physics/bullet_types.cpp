@@ -18,8 +18,8 @@ Principal principal_axes(double mass, const Eigen::Vector3d& com, const Eigen::M
   return p;
 }
 
-std::unique_ptr<btConvexHullShape> rounded_hull(const std::vector<Eigen::Vector3d>& points,
-                                                double margin) {
+std::unique_ptr<btConvexInternalShape> rounded_hull(const std::vector<Eigen::Vector3d>& points,
+                                                    double margin) {
   btConvexHullComputer hull;
   constexpr double kClamp = 0.25;  // never by more than a quarter of the smallest half width
   const bool enough = points.size() >= 4;
@@ -32,11 +32,12 @@ std::unique_ptr<btConvexHullShape> rounded_hull(const std::vector<Eigen::Vector3
       reinterpret_cast<const btScalar*>(&hull.vertices[0]), hull.vertices.size(),
       sizeof(btVector3));
   shape->setMargin(margin);
+  shape->recalcLocalAabb();  // made with Bullet's default margin of 40 mm until now
   return shape;
 }
 
-std::unique_ptr<btConvexHullShape> reduced_hull(const TriangleMesh& mesh, const Pose& T_shape_mesh,
-                                                double margin) {
+std::unique_ptr<btConvexInternalShape> reduced_hull(const TriangleMesh& mesh, const Pose& T_shape_mesh,
+                                                    double margin) {
   btConvexHullShape full;
   for (const auto& v : mesh.vertices)
     full.addPoint(to_bullet(Eigen::Vector3d(T_shape_mesh * v.cast<double>())), false);

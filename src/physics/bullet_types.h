@@ -10,8 +10,7 @@
 #include "iwgnet_grasp/core/mesh.h"
 #include "iwgnet_grasp/core/types.h"
 
-class btCollisionShape;
-class btConvexHullShape;
+class btConvexInternalShape;
 
 namespace iwgnet_grasp::physics {
 
@@ -43,11 +42,11 @@ Principal principal_axes(double mass, const Eigen::Vector3d& com, const Eigen::M
 
 // Convex hull of the points, its faces moved inwards by `margin` and rounded by as much, so that
 // the outer size stays. Throws Error when the points span no volume.
-std::unique_ptr<btConvexHullShape> rounded_hull(const std::vector<Eigen::Vector3d>& points,
-                                                double margin);
+std::unique_ptr<btConvexInternalShape> rounded_hull(const std::vector<Eigen::Vector3d>& points,
+                                                    double margin);
 // The same of at most 42 of the points, the extreme ones: for links of the robot.
-std::unique_ptr<btConvexHullShape> reduced_hull(const TriangleMesh& mesh, const Pose& T_shape_mesh,
-                                                double margin);
+std::unique_ptr<btConvexInternalShape> reduced_hull(const TriangleMesh& mesh, const Pose& T_shape_mesh,
+                                                    double margin);
 
 // Collision groups.
 enum Group : int { kStaticGroup = 1, kPartGroup = 2, kRobotGroup = 4 };

@@ -1,6 +1,5 @@
 #include "robot_body.h"
 
-#include <BulletCollision/CollisionShapes/btCompoundShape.h>
 #include <BulletDynamics/Featherstone/btMultiBodyDynamicsWorld.h>
 #include <BulletDynamics/Featherstone/btMultiBodyJointLimitConstraint.h>
 
@@ -96,6 +95,7 @@ RobotBody::RobotBody(const RobotModel& model, const PhysicsConfig& config, const
     object->setCollisionShape(links[i].shape.get());
     object->setWorldTransform(to_bullet(zero[i]));
     friction(*object, links[i]);
+    object->forceActivationState(ISLAND_SLEEPING);
     base_.push_back(std::move(object));
   }
   btAlignedObjectArray<btQuaternion> rotations;

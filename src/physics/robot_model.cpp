@@ -1,7 +1,6 @@
 #include "robot_model.h"
 
 #include <BulletCollision/CollisionShapes/btBoxShape.h>
-#include <BulletCollision/CollisionShapes/btCompoundShape.h>
 #include <BulletCollision/CollisionShapes/btConvexHullShape.h>
 #include <BulletCollision/CollisionShapes/btCylinderShape.h>
 #include <BulletCollision/CollisionShapes/btSphereShape.h>
@@ -34,8 +33,9 @@ std::string resolve(const std::string& uri, const std::string& package_dir) {
   return package_dir + uri.substr(slash);
 }
 
-std::unique_ptr<btCollisionShape> collision_shape(const urdf::Geometry& geometry,
-                                                  const std::string& package_dir, double margin) {
+std::unique_ptr<btConvexInternalShape> collision_shape(const urdf::Geometry& geometry,
+                                                       const std::string& package_dir,
+                                                       double margin) {
   switch (geometry.type) {
     case urdf::Geometry::BOX: {
       const auto& d = static_cast<const urdf::Box&>(geometry).dim;
@@ -184,13 +184,11 @@ RobotModel::RobotModel(const std::string& urdf_xml, const std::string& package_d
     }
     if (link.body < 0 && !grounded[i]) continue;
     if (sources[i]->collision_array.empty()) continue;
-    link.shape = std::make_unique<btCompoundShape>();
-    for (const auto& collision : sources[i]->collision_array) {
-      link.pieces.push_back(collision_shape(*collision->geometry, package_dir, config.margin));
-      link.shape->addChildShape(
-          to_bullet(Pose(link.T_link_principal.inverse() * pose_of(collision->origin))),
-          link.pieces.back().get());
-    }
+    link.shape = std::make_unique<PiecesShape>();
+    for (const auto& collision : sources[i]->collision_array)
+      link.shape->add(
+          collision_shape(*collision->geometry, package_dir, config.margin),
+          to_bullet(Pose(link.T_link_principal.inverse() * pose_of(collision->origin))));
   }
 
   KDL::Tree tree;

@@ -8,8 +8,7 @@
 
 #include "bullet_types.h"
 #include "physics_config.h"
-
-class btCompoundShape;
+#include "pieces.h"
 
 namespace iwgnet_grasp::physics {
 
@@ -31,8 +30,7 @@ struct RobotLink {
   int body = -1;   // index of its multibody link; -1: root, lumped into its owner or kinematic
   int rank = 0;    // arm joints between the root and this link; the gripper counts as one more
   bool pad = false;
-  std::unique_ptr<btCompoundShape> shape;             // in the principal frame of the link
-  std::vector<std::unique_ptr<btCollisionShape>> pieces;
+  std::unique_ptr<PiecesShape> shape;                 // in the principal frame of the link
   Pose T_link_principal = Pose::Identity();
 };
 

@@ -38,8 +38,6 @@ class Random {
 constexpr int kPlacements = 2000;         // tries to place one part before all are laid anew
 constexpr int kLayouts = 50;
 constexpr double kFlatClearance = 0.0005;  // m above the table, scattered parts are let go
-constexpr double kFallTime = 0.30;        // s between two drops
-constexpr double kSettleTime = 12.0;      // s a scene may take to come to rest
 constexpr int kDrops = 12;                // times one part may be dropped again
 constexpr double kMaxHeight = 0.11;       // m: the D455 sees nothing nearer than 0.49 m
 
@@ -166,7 +164,7 @@ void scatter(World& world, const SceneSpec& spec, const CellConfig& cell,
       T.translation() << placed[i].at, kFlatClearance - lowest(models[i], placed[i].R);
       world.add_part(models[i], T);
     }
-    run_until_rest(world, kSettleTime);
+    run_until_rest(world, spec.settle_time);
     return;
   }
   throw Error("scene '" + spec.name + "': " + std::to_string(spec.count) +
@@ -191,13 +189,13 @@ void stack(World& world, const SceneSpec& spec, const CellConfig& cell,
         top + spec.drop_height - lowest(models[part], T.linear());
     return T;
   };
-  const long fall = std::lround(kFallTime / world.timestep());
+  const long fall = std::lround(spec.drop_interval / world.timestep());
   for (std::size_t i = 0; i < models.size(); ++i) {
     world.add_part(models[i], drop_pose(static_cast<int>(i)));
     for (long s = 0; s < fall; ++s) world.step();
   }
   for (int drop = 0;; ++drop) {
-    run_until_rest(world, kSettleTime);
+    run_until_rest(world, spec.settle_time);
     std::vector<int> stray;
     for (int k = 0; k < world.part_count(); ++k) {
       const Pose T = world.part(k).T_base_part;

@@ -217,7 +217,9 @@ struct SimulatedCell::Impl {
     };
     box(config.table, appearance.table);
     for (const Box& wall : config.tray.boxes()) box(wall, appearance.tray);
-    for (const Box& beam : config.camera_mount) box(beam, appearance.mount);
+    for (const Box& beam : config.camera_mount)
+      camera_boxes.push_back({renderer.add_box(beam.size), beam.center, appearance.mount});
+    add_camera_body();
     box({{0, 0, kFloorHeight - 0.05}, {8, 8, 0.1}}, appearance.floor);
   }
 
@@ -243,7 +245,10 @@ struct SimulatedCell::Impl {
       const int instance = renderer.add_instance(boxes[i].mesh, boxes[i].material, T);
       if (i == 0) table_instance = instance;
     }
-    add_camera_body();
+    camera_instances.clear();
+    for (const BoxDrawing& b : camera_boxes)
+      camera_instances.push_back(renderer.add_instance(b.mesh, b.material, Pose::Identity()));
+    place_camera();
     const std::size_t start = mix(seed, 77) % appearance.parts.size();
     for (std::size_t i = 0; i < models.size(); ++i)
       part_instances.push_back(renderer.add_instance(
@@ -262,9 +267,19 @@ struct SimulatedCell::Impl {
     Eigen::Vector3d size = c.body_size, center = c.body_center;
     size.x() = front - back;
     center.x() = (front + back) / 2;
-    if (camera_mesh < 0) camera_mesh = renderer.add_box(size);
-    renderer.add_instance(camera_mesh, appearance.camera,
-                          c.T_base_camera_link() * Pose(Eigen::Translation3d(center)));
+    // Axes of camera_link are right angles of the base's (camera.yaml looks straight down), so the
+    // body is drawn as a box of base_link like the beams.
+    const Pose T = c.T_base_camera_link();
+    camera_boxes.push_back({renderer.add_box((T.linear() * size).cwiseAbs()), T * center,
+                            appearance.camera});
+  }
+
+  // Body and mount move with the camera.
+  void place_camera() {
+    const Pose moved = camera.T_base_color * config.camera.T_base_color.inverse();
+    for (std::size_t i = 0; i < camera_boxes.size(); ++i)
+      renderer.set_pose(camera_instances[i],
+                        moved * Pose(Eigen::Translation3d(camera_boxes[i].center)));
   }
 
   void sync() {
@@ -306,10 +321,10 @@ struct SimulatedCell::Impl {
 
   std::map<std::string, int> meshes, part_meshes;
   std::vector<LinkDrawing> drawings;
-  std::vector<BoxDrawing> boxes;
+  std::vector<BoxDrawing> boxes, camera_boxes;
   std::vector<LinkVisual> link_visuals;
-  std::vector<int> part_instances;
-  int camera_mesh = -1, table_instance = -1;
+  std::vector<int> part_instances, camera_instances;
+  int table_instance = -1;
 
   std::vector<PartModel> models;
   std::uint64_t seed = 0, frames = 0;
@@ -386,7 +401,10 @@ cv::Mat SimulatedCell::aligned_depth(const cv::Mat& depth) const {
 }
 
 const CameraConfig& SimulatedCell::camera() const { return impl_->camera; }
-void SimulatedCell::set_camera(const CameraConfig& camera) { impl_->camera = camera; }
+void SimulatedCell::set_camera(const CameraConfig& camera) {
+  impl_->camera = camera;
+  impl_->place_camera();
+}
 
 World& SimulatedCell::world() { return impl_->world; }
 sensing::Renderer& SimulatedCell::renderer() { return impl_->renderer; }
@@ -449,6 +467,20 @@ std::vector<double> SimulatedCell::unoccluded_areas() {
   }
   show_parts(true);
   return areas;
+}
+
+void SimulatedCell::lay_in_tray(int part, int slot) {
+  Impl& m = *impl_;
+  part_instance(part);  // throws for an index that is not there
+  const auto slots = m.config.tray.slots();
+  if (slot < 0 || slot >= static_cast<int>(slots.size()))
+    throw Error("slot " + std::to_string(slot) + ": the tray has " + std::to_string(slots.size()));
+  float lowest = 0.0f;
+  for (const auto& v : m.models[part].mesh.vertices) lowest = std::min(lowest, v.z());
+  Pose T = Pose::Identity();
+  T.linear() = Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  T.translation() = slots[slot] - Eigen::Vector3d(0, 0, lowest);
+  m.world.set_part_pose(part, T);
 }
 
 void SimulatedCell::show_parts(bool shown) {

@@ -1,16 +1,14 @@
 #include "iwgnet_grasp/physics/world.h"
 
 #include <BulletCollision/CollisionShapes/btBoxShape.h>
-#include <BulletCollision/CollisionShapes/btCompoundShape.h>
-#include <BulletCollision/CollisionShapes/btConvexHullShape.h>
 #include <BulletDynamics/Dynamics/btRigidBody.h>
 #include <BulletDynamics/Featherstone/btMultiBodyConstraintSolver.h>
-#include <BulletDynamics/Featherstone/btMultiBodyDynamicsWorld.h>
 #include <btBulletCollisionCommon.h>
 
 #include <algorithm>
 #include <cmath>
 
+#include "pieces.h"
 #include "robot_body.h"
 
 extern btScalar gDeactivationTime;
@@ -37,26 +35,28 @@ struct RobotFilter : btOverlapFilterCallback {
 
 struct StaticBody {
   Tag tag;
-  btBoxShape shape;
+  PiecesShape shape;
   btCollisionObject object;
 
   StaticBody(const std::string& name, const Eigen::Vector3d& size, const Pose& T_base_box,
              double friction, const PhysicsConfig& config)
-      : tag{name}, shape(to_bullet(Eigen::Vector3d(size / 2))) {
-    shape.setMargin(std::min(config.margin, size.minCoeff() / 4));
+      : tag{name} {
+    auto box = std::make_unique<btBoxShape>(to_bullet(Eigen::Vector3d(size / 2)));
+    box->setMargin(std::min(config.margin, size.minCoeff() / 4));
+    shape.add(std::move(box), btTransform::getIdentity());
     object.setCollisionShape(&shape);
     object.setWorldTransform(to_bullet(T_base_box));
     object.setFriction(friction);
     object.setRestitution(config.restitution);
     object.setUserPointer(&tag);
+    object.setActivationState(ISLAND_SLEEPING);  // else its pairs with sleeping parts cost time
   }
 };
 
 struct PartBody {
   Tag tag;
   int model;
-  std::vector<std::unique_ptr<btConvexHullShape>> pieces;
-  btCompoundShape shape;
+  PiecesShape shape;
   std::unique_ptr<btRigidBody> body;
   Pose T_part_principal;
 };
@@ -98,16 +98,17 @@ struct World::Impl {
     clear();
     gDeactivationTime = config.sleep_time;
     gContactBreakingThreshold = config.breaking_distance;
-    collision = std::make_unique<btDefaultCollisionConfiguration>();
+    collision = std::make_unique<PiecesConfiguration>();
     dispatcher = std::make_unique<btCollisionDispatcher>(collision.get());
     dispatcher->setDispatcherFlags(dispatcher->getDispatcherFlags() &
                                    ~btCollisionDispatcher::CD_USE_RELATIVE_CONTACT_BREAKING_THRESHOLD);
     broadphase = std::make_unique<btDbvtBroadphase>();
     broadphase->getOverlappingPairCache()->setOverlapFilterCallback(&filter);
     solver = std::make_unique<btMultiBodyConstraintSolver>();
-    world = std::make_unique<btMultiBodyDynamicsWorld>(dispatcher.get(), broadphase.get(),
-                                                       solver.get(), collision.get());
+    world = std::make_unique<ContactIslandWorld>(dispatcher.get(), broadphase.get(), solver.get(),
+                                                 collision.get());
     world->setGravity(btVector3(0, 0, -config.gravity));
+    world->setForceUpdateAllAabbs(false);
     auto& info = world->getSolverInfo();
     info.m_timeStep = config.timestep;
     info.m_numIterations = config.iterations;
@@ -129,11 +130,11 @@ struct World::Impl {
   RobotModel model;
   std::vector<std::unique_ptr<StaticBody>> statics;
   RobotFilter filter;
-  std::unique_ptr<btDefaultCollisionConfiguration> collision;
+  std::unique_ptr<PiecesConfiguration> collision;
   std::unique_ptr<btCollisionDispatcher> dispatcher;
   std::unique_ptr<btDbvtBroadphase> broadphase;
   std::unique_ptr<btMultiBodyConstraintSolver> solver;
-  std::unique_ptr<btMultiBodyDynamicsWorld> world;
+  std::unique_ptr<ContactIslandWorld> world;
   std::unique_ptr<RobotBody> robot;
   bool simulated = true;
   std::vector<std::unique_ptr<PartBody>> parts;
@@ -159,8 +160,7 @@ int World::add_part(const PartModel& model, const Pose& T_base_part) {
   for (const auto& piece : model.pieces) {
     std::vector<Eigen::Vector3d> points;
     for (const auto& v : piece.vertices) points.push_back(T_principal_part * v.cast<double>());
-    part->pieces.push_back(rounded_hull(points, config.margin));
-    part->shape.addChildShape(btTransform::getIdentity(), part->pieces.back().get());
+    part->shape.add(rounded_hull(points, config.margin), btTransform::getIdentity());
   }
   btRigidBody::btRigidBodyConstructionInfo info(p.mass, nullptr, &part->shape,
                                                 to_bullet(p.moments));
@@ -186,8 +186,11 @@ void World::set_part_pose(int part, const Pose& T_base_part) {
   body.setLinearVelocity(btVector3(0, 0, 0));
   body.setAngularVelocity(btVector3(0, 0, 0));
   body.clearForces();
-  body.forceActivationState(ACTIVE_TAG);
-  body.setDeactivationTime(0.0);
+  // What lay on it or against it must not stay asleep in the air.
+  for (auto& other : impl_->parts) {
+    other->body->forceActivationState(ACTIVE_TAG);
+    other->body->setDeactivationTime(0.0);
+  }
   impl_->broadphase->getOverlappingPairCache()->cleanProxyFromPairs(body.getBroadphaseProxy(),
                                                                     impl_->dispatcher.get());
   impl_->world->updateSingleAabb(&body);

@@ -1,0 +1,303 @@
+#include "pieces.h"
+
+#include <BulletCollision/BroadphaseCollision/btCollisionAlgorithm.h>
+#include <BulletCollision/CollisionDispatch/btCollisionObjectWrapper.h>
+#include <BulletCollision/CollisionDispatch/btManifoldResult.h>
+#include <BulletCollision/CollisionDispatch/btSimulationIslandManager.h>
+#include <BulletCollision/NarrowPhaseCollision/btGjkEpaPenetrationDepthSolver.h>
+#include <BulletCollision/NarrowPhaseCollision/btGjkPairDetector.h>
+#include <BulletCollision/NarrowPhaseCollision/btPersistentManifold.h>
+#include <BulletCollision/NarrowPhaseCollision/btVoronoiSimplexSolver.h>
+#include <BulletDynamics/Featherstone/btMultiBody.h>
+#include <BulletDynamics/Featherstone/btMultiBodyLinkCollider.h>
+
+extern btScalar gContactBreakingThreshold;
+extern bool gContactCalcArea3Points;
+
+namespace iwgnet_grasp::physics {
+namespace {
+
+bool apart(const btVector3& d, const btVector3& reach) {
+  return btFabs(d.x()) > reach.x() || btFabs(d.y()) > reach.y() || btFabs(d.z()) > reach.z();
+}
+
+constexpr double kNear = 0.002;         // m: pairs of pieces closer than this are looked at each step
+constexpr double kSameNormal = 0.8;     // cosine: contacts within it share a patch
+constexpr std::size_t kPatches = 6;     // patches of contact between two bodies
+constexpr double kLargerArea = 1.1;     // squared area a fifth point must add to replace another
+
+// What one query of two pieces found.
+struct Touch : btDiscreteCollisionDetectorInterface::Result {
+  bool found = false;
+  btVector3 normal, point;  // on b, world
+  btScalar distance = 0.0;  // m, negative: penetration
+  void setShapeIdentifiersA(int, int) override {}
+  void setShapeIdentifiersB(int, int) override {}
+  void addContactPoint(const btVector3& n, const btVector3& p, btScalar d) override {
+    found = true;
+    normal = n;
+    point = p;
+    distance = d;
+  }
+};
+
+// Squared extent of the quadrilateral of four points in any order (as Bullet measures it).
+btScalar extent(const btVector3& p0, const btVector3& p1, const btVector3& p2,
+                const btVector3& p3) {
+  const btScalar a = (p0 - p1).cross(p2 - p3).length2();
+  const btScalar b = (p0 - p2).cross(p1 - p3).length2();
+  const btScalar c = (p0 - p3).cross(p1 - p2).length2();
+  return btMax(a, btMax(b, c));
+}
+
+class PiecesAlgorithm : public btCollisionAlgorithm {
+ public:
+  PiecesAlgorithm(const btCollisionAlgorithmConstructionInfo& info)
+      : btCollisionAlgorithm(info) {}
+  ~PiecesAlgorithm() override {
+    for (auto* patch : patches_) m_dispatcher->releaseManifold(patch);
+  }
+
+  void processCollision(const btCollisionObjectWrapper* a, const btCollisionObjectWrapper* b,
+                        const btDispatcherInfo&, btManifoldResult* result) override {
+    const auto& pieces_a = static_cast<const PiecesShape*>(a->getCollisionShape())->pieces();
+    const auto& shape_b = *static_cast<const PiecesShape*>(b->getCollisionShape());
+    const auto& pieces_b = shape_b.pieces();
+    const btTransform &Ta = a->getWorldTransform(), &Tb = b->getWorldTransform();
+    const btTransform T_a_b = Ta.inverseTimes(Tb);
+    const btScalar slack = gContactBreakingThreshold;
+
+    if (!listed_ || moved(T_a_b, shape_b.radius()) > kNear) {
+      list_pairs(pieces_a, pieces_b, T_a_b, slack + kNear);
+      for (Pair& pair : pairs_) {
+        Touch touch;
+        query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack + kNear, pair.axis, touch);
+        pair.near = touch.found;
+      }
+      T_listed_ = T_a_b;
+      listed_ = true;
+    }
+    for (Pair& pair : pairs_) {
+      if (!pair.near) continue;
+      Touch touch;
+      query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, pair.axis, touch);
+      if (touch.found) admit(touch, a, b, *result);
+    }
+    for (auto* patch : patches_) {
+      result->setPersistentManifold(patch);
+      result->refreshContactPoints();
+    }
+  }
+
+  btScalar calculateTimeOfImpact(btCollisionObject*, btCollisionObject*, const btDispatcherInfo&,
+                                 btManifoldResult*) override {
+    return 1.0;
+  }
+  void getAllContactManifolds(btManifoldArray& manifolds) override {
+    for (auto* patch : patches_) manifolds.push_back(patch);
+  }
+
+ private:
+  struct Pair {
+    int a, b;
+    bool near;
+    btVector3 axis;  // from b to a in a's frame: along it the two were last seen apart
+  };
+
+  // Bound on the motion of any point of b as seen from a since the pairs were listed.
+  btScalar moved(const btTransform& T_a_b, btScalar radius) const {
+    btScalar turn = 0.0;
+    for (int r = 0; r < 3; ++r)
+      turn += (T_a_b.getBasis()[r] - T_listed_.getBasis()[r]).length2();
+    return (T_a_b.getOrigin() - T_listed_.getOrigin()).length() + btSqrt(turn) * radius;
+  }
+
+  // Pairs of pieces whose bounds, widened by `reach`, meet in both bodies' axes.
+  void list_pairs(const std::vector<PiecesShape::Piece>& pieces_a,
+                  const std::vector<PiecesShape::Piece>& pieces_b, const btTransform& T_a_b,
+                  btScalar reach) {
+    const btTransform T_b_a = T_a_b.inverse();
+    const btMatrix3x3 abs_a_b = T_a_b.getBasis().absolute(), abs_b_a = abs_a_b.transpose();
+    const btVector3 margin(reach, reach, reach);
+    std::vector<Pair> before;
+    before.swap(pairs_);
+    std::size_t k = 0;  // `before` is in the same order
+    for (int j = 0; j < static_cast<int>(pieces_b.size()); ++j) {
+      const auto& pb = pieces_b[j];
+      const btVector3 center_b = T_a_b * pb.center;
+      const btVector3 half_b = abs_a_b * pb.half + margin;
+      for (int i = 0; i < static_cast<int>(pieces_a.size()); ++i) {
+        const auto& pa = pieces_a[i];
+        if (apart(center_b - pa.center, half_b + pa.half)) continue;
+        if (apart(T_b_a * pa.center - pb.center, abs_b_a * pa.half + margin + pb.half)) continue;
+        while (k < before.size() &&
+               (before[k].b < j || (before[k].b == j && before[k].a < i)))
+          ++k;
+        const bool known = k < before.size() && before[k].b == j && before[k].a == i;
+        pairs_.push_back({i, j, true, known ? before[k].axis : btVector3(0, 0, 0)});
+      }
+    }
+  }
+
+  static void query(const PiecesShape::Piece& a, const btTransform& Ta,
+                    const PiecesShape::Piece& b, const btTransform& Tb, btScalar slack,
+                    btVector3& axis, Touch& touch) {
+    btDiscreteCollisionDetectorInterface::ClosestPointInput input;
+    input.m_transformA = Ta * a.T_body_piece;
+    input.m_transformB = Tb * b.T_body_piece;
+    const btScalar reach = a.shape->getMargin() + b.shape->getMargin() + slack;
+    if (!axis.fuzzyZero()) {
+      const btVector3 world = Ta.getBasis() * axis;
+      const btVector3 low = input.m_transformA * a.shape->localGetSupportingVertexWithoutMargin(
+                                                     -world * input.m_transformA.getBasis());
+      const btVector3 high = input.m_transformB * b.shape->localGetSupportingVertexWithoutMargin(
+                                                      world * input.m_transformB.getBasis());
+      if ((low - high).dot(world) > reach) return;
+    }
+    input.m_maximumDistanceSquared = reach * reach;
+    btVoronoiSimplexSolver simplex;
+    btGjkEpaPenetrationDepthSolver depth;
+    btGjkPairDetector detector(a.shape.get(), b.shape.get(), &simplex, &depth);
+    detector.getClosestPointsNonVirtual(input, touch, nullptr);
+    const btVector3& found = detector.getCachedSeparatingAxis();
+    const btScalar length = found.length();
+    axis = length > SIMD_EPSILON ? (found / length) * Ta.getBasis() : btVector3(0, 0, 0);
+  }
+
+  // The patch that a contact belongs to: one of a like normal, else a fresh one.
+  btPersistentManifold* patch_for(const btVector3& normal, const btCollisionObjectWrapper* a,
+                                  const btCollisionObjectWrapper* b) {
+    btPersistentManifold *best = nullptr, *empty = nullptr;
+    btScalar likeness = -2.0;
+    for (auto* patch : patches_) {
+      if (patch->getNumContacts() == 0) {
+        if (!empty) empty = patch;
+        continue;
+      }
+      const btScalar cosine = patch->getContactPoint(0).m_normalWorldOnB.dot(normal);
+      if (cosine > likeness) {
+        likeness = cosine;
+        best = patch;
+      }
+    }
+    if (best && likeness > kSameNormal) return best;
+    if (empty) return empty;
+    if (patches_.size() == kPatches) return best;
+    patches_.push_back(
+        m_dispatcher->getNewManifold(a->getCollisionObject(), b->getCollisionObject()));
+    return patches_.back();
+  }
+
+  // Bullet lets a fifth point always replace one of four, which makes resting bodies shiver:
+  // admit it only when it renews one of them, widens the patch or is the deepest.
+  void admit(const Touch& touch, const btCollisionObjectWrapper* a,
+             const btCollisionObjectWrapper* b, btManifoldResult& result) {
+    btPersistentManifold* patch = patch_for(touch.normal, a, b);
+    if (patch->getNumContacts() == MANIFOLD_CACHE_SIZE) {
+      btVector3 p[MANIFOLD_CACHE_SIZE];
+      bool renews = false;
+      int deepest = -1;
+      btScalar depth = touch.distance;
+      for (int k = 0; k < MANIFOLD_CACHE_SIZE; ++k) {
+        const btManifoldPoint& point = patch->getContactPoint(k);
+        p[k] = point.getPositionWorldOnB();
+        renews = renews || (p[k] - touch.point).length() < patch->getContactBreakingThreshold();
+        if (point.getDistance() < depth) {
+          depth = point.getDistance();
+          deepest = k;
+        }
+      }
+      if (!renews) {
+        const btScalar now = extent(p[0], p[1], p[2], p[3]);
+        btScalar best = 0.0;
+        for (int k = 0; k < MANIFOLD_CACHE_SIZE; ++k) {
+          if (k == deepest) continue;
+          const btVector3 kept = p[k];
+          p[k] = touch.point;
+          best = btMax(best, extent(p[0], p[1], p[2], p[3]));
+          p[k] = kept;
+        }
+        if (best < kLargerArea * now) return;
+      }
+    }
+    result.setPersistentManifold(patch);
+    result.addContactPoint(touch.normal, touch.point, touch.distance);
+  }
+
+  std::vector<btPersistentManifold*> patches_;
+  std::vector<Pair> pairs_;
+  bool listed_ = false;
+  btTransform T_listed_;
+};
+
+struct CreatePiecesAlgorithm : btCollisionAlgorithmCreateFunc {
+  btCollisionAlgorithm* CreateCollisionAlgorithm(btCollisionAlgorithmConstructionInfo& info,
+                                                 const btCollisionObjectWrapper*,
+                                                 const btCollisionObjectWrapper*) override {
+    void* memory = info.m_dispatcher1->allocateCollisionAlgorithm(sizeof(PiecesAlgorithm));
+    return new (memory) PiecesAlgorithm(info);
+  }
+};
+
+btDefaultCollisionConstructionInfo pool_info() {
+  btDefaultCollisionConstructionInfo info;
+  info.m_customCollisionAlgorithmMaxElementSize = sizeof(PiecesAlgorithm);
+  return info;
+}
+
+}  // namespace
+
+void PiecesShape::add(std::unique_ptr<btConvexInternalShape> shape,
+                      const btTransform& T_body_piece) {
+  btVector3 low, high;
+  shape->getAabb(T_body_piece, low, high);
+  addChildShape(T_body_piece, shape.get());
+  const btVector3 center = (low + high) / 2, half = (high - low) / 2;
+  radius_ = btMax(radius_, center.length() + half.length());
+  pieces_.push_back({std::move(shape), T_body_piece, center, half});
+}
+
+PiecesConfiguration::PiecesConfiguration()
+    : btDefaultCollisionConfiguration(pool_info()),
+      create_(std::make_unique<CreatePiecesAlgorithm>()) {
+  gContactCalcArea3Points = false;  // judge points as extent() does
+}
+
+btCollisionAlgorithmCreateFunc* PiecesConfiguration::getCollisionAlgorithmCreateFunc(int type_a,
+                                                                                     int type_b) {
+  if (type_a == COMPOUND_SHAPE_PROXYTYPE && type_b == COMPOUND_SHAPE_PROXYTYPE)
+    return create_.get();
+  return btDefaultCollisionConfiguration::getCollisionAlgorithmCreateFunc(type_a, type_b);
+}
+
+void ContactIslandWorld::calculateSimulationIslands() {
+  btSimulationIslandManager& islands = *getSimulationIslandManager();
+  int moving = 0;
+  for (int i = 0; i < getNumCollisionObjects(); ++i) {
+    btCollisionObject* object = getCollisionObjectArray()[i];
+    if (!object->isStaticOrKinematicObject()) object->setIslandTag(moving++);
+    object->setCompanionId(-1);
+    object->setHitFraction(1.0);
+  }
+  islands.initUnionFind(moving);
+  const auto unite = [&](const btCollisionObject* a, const btCollisionObject* b) {
+    if (a && b && !a->isStaticOrKinematicObject() && !b->isStaticOrKinematicObject())
+      islands.getUnionFind().unite(a->getIslandTag(), b->getIslandTag());
+  };
+  for (int i = 0; i < getDispatcher()->getNumManifolds(); ++i) {
+    const btPersistentManifold* manifold = getDispatcher()->getManifoldByIndexInternal(i);
+    if (manifold->getNumContacts() > 0) unite(manifold->getBody0(), manifold->getBody1());
+  }
+  for (int k = 0; k < getNumMultibodies(); ++k) {
+    const btMultiBody* body = getMultiBody(k);
+    const btCollisionObject* first = nullptr;
+    for (int l = 0; l < body->getNumLinks(); ++l) {
+      const btCollisionObject* link = body->getLink(l).m_collider;
+      unite(first, link);
+      if (!first) first = link;
+    }
+  }
+  islands.storeIslandActivationState(getCollisionWorld());
+}
+
+}  // namespace iwgnet_grasp::physics
