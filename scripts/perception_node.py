@@ -37,6 +37,7 @@ class PerceptionNode:
                 image_array(scene.empty_depth, f"{Topics.SCENE} empty_depth"),
             )
             result.objects = [object_to_message(o) for o in look.objects]
+            result.window_px = self.perception.estimator.input_px
             rospy.loginfo(
                 f"scene {scene.scene_id}: {len(look.objects)} objects in "
                 f"{look.seconds['total'] * 1e3:.0f} ms"

@@ -41,6 +41,10 @@ ActionOutcome<typename Action::_action_result_type::_result_type> call_action(
   ActionOutcome<Result> outcome;
   const auto wall_start = Clock::now();
   const auto waited = [&] { return std::chrono::duration<double>(Clock::now() - wall_start).count(); };
+  if (cancelled && cancelled()) {
+    outcome.message = "cancelled";
+    return outcome;
+  }
   while (ros::ok() && !client.isServerConnected()) {
     if (waited() > 10.0) {
       outcome.message = "no action server on " + name + ": is its node or driver running?";

@@ -71,15 +71,8 @@ class RosRobot : public motion::Robot {
   }
 
   motion::GripResult grip(double gap_m, double /*force_n: topic 4 carries it*/) override {
-    GripGoal goal = grip_goal_;
-    if (gap_m < held_gap_min_) {
-      goal.command = GripGoal::CLOSE;
-      closed_ = true;
-    } else {
-      goal.command = closed_ ? GripGoal::RELEASE : GripGoal::OPEN;
-      goal.gap = gap_m;
-    }
-    const auto outcome = call_action(gripper_, Topics::GRIP, goal, ros::Duration(30.0), cancelled_);
+    const auto outcome =
+        call_action(gripper_, Topics::GRIP, goal_for(gap_m), ros::Duration(30.0), cancelled_);
     motion::GripResult result;
     result.success = outcome.finished && outcome.succeeded;
     result.stalled = outcome.result.stalled;
@@ -88,7 +81,29 @@ class RosRobot : public motion::Robot {
     return result;
   }
 
+  // The arm starts while the gripper still opens; the next grip() takes over from this goal.
+  motion::GripResult preset(double gap_m, double force_n) override {
+    if (!gripper_.isServerConnected()) return grip(gap_m, force_n);  // which waits and says why not
+    gripper_.sendGoal(goal_for(gap_m));
+    motion::GripResult result;
+    result.success = true;
+    result.gap = gap_m;
+    return result;
+  }
+
  private:
+  GripGoal goal_for(double gap_m) {
+    GripGoal goal = grip_goal_;
+    goal.gap = gap_m;
+    if (gap_m < held_gap_min_) {
+      goal.command = GripGoal::CLOSE;
+      closed_ = true;
+    } else {
+      goal.command = closed_ ? GripGoal::RELEASE : GripGoal::OPEN;
+    }
+    return goal;
+  }
+
   void on_joints(const sensor_msgs::JointState::ConstPtr& state) {
     const auto joints = arm_joints(*state);
     if (!joints) return;  // the gripper's own joint state

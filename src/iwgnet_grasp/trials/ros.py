@@ -78,12 +78,10 @@ class RosCell:
         simulated: bool = True,
         check: Callable[[], None] | None = None,
         on_plan: Callable[[Any], None] | None = None,
-        window_px: int = 300,
     ) -> None:
         self._simulated = simulated
         self._check = check or functools.partial(check_nodes, _required(simulated))
         self._on_plan = on_plan
-        self._window_px = window_px
         self._changed = threading.Condition()
         self._newest: dict[str, Any] = {}
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="service")
@@ -229,7 +227,7 @@ class RosCell:
             depth = metres(image_array(scene.depth, Topics.SCENE))
             empty = metres(image_array(scene.empty_depth, Topics.SCENE))
             objects = tuple(object_from_message(o) for o in grasps.objects)
-            windows = tuple(crop_window(depth, empty, o.box, self._window_px) for o in objects)
+            windows = tuple(crop_window(depth, empty, o.box, grasps.window_px) for o in objects)
         except PerceptionError as error:
             raise CellError(str(error)) from None
         look = Look(color, depth, empty, objects, windows)
