@@ -67,12 +67,14 @@ void bind_physics(py::module_& m) {
       .value("STACKED", Arrangement::kStacked, "dropped one after another onto a heap");
   py::class_<SceneSpec>(m, "SceneSpec", "How many parts, and how they come to lie; lengths in m.")
       .def(py::init([](int count, Arrangement arrangement, std::vector<std::string> families,
-                       double min_gap, const Eigen::Vector2d& drop_area, double drop_height) {
-             return SceneSpec{"", count, arrangement, std::move(families), min_gap, drop_area,
-                              drop_height};
+                       double min_gap, const Eigen::Vector2d& drop_area, double drop_height,
+                       double drop_interval, double settle_time) {
+             return SceneSpec{"",        count,       arrangement,   std::move(families), min_gap,
+                              drop_area, drop_height, drop_interval, settle_time};
            }),
            "count"_a, "arrangement"_a, "families"_a = std::vector<std::string>{},
-           "min_gap"_a = 0.0, "drop_area"_a = Eigen::Vector2d(0.16, 0.16), "drop_height"_a = 0.06)
+           "min_gap"_a = 0.0, "drop_area"_a = Eigen::Vector2d(0.16, 0.16), "drop_height"_a = 0.06,
+           "drop_interval"_a = SceneSpec().drop_interval, "settle_time"_a = SceneSpec().settle_time)
       .def_readwrite("count", &SceneSpec::count)
       .def_readwrite("arrangement", &SceneSpec::arrangement)
       .def_readwrite("families", &SceneSpec::families);
@@ -186,6 +188,8 @@ void bind_physics(py::module_& m) {
             return c.unoccluded_areas();
           },
           "px that each part would cover with nothing before it")
+      .def("lay_in_tray", &SimulatedCell::lay_in_tray, "part"_a, "slot"_a,
+           "Moves a part into a slot of the tray at once: for the looks of a half-cleared table.")
       .def("show_parts", &SimulatedCell::show_parts, "shown"_a,
            "Whether the camera sees the parts; the physics keeps them.")
       .def("set_light", &SimulatedCell::set_light, "light"_a)

@@ -213,12 +213,13 @@ struct SimulatedCell::Impl {
     for (const auto& part : library) part_meshes[part.name] = renderer.add_mesh(part.mesh);
 
     const auto box = [&](const Box& b, const sensing::Material& m) {
-      boxes.push_back({renderer.add_box(b.size), b.center, m});
+      boxes.push_back({renderer.add_box(b.size), Pose(Eigen::Translation3d(b.center)), m});
     };
     box(config.table, appearance.table);
     for (const Box& wall : config.tray.boxes()) box(wall, appearance.tray);
     for (const Box& beam : config.camera_mount)
-      camera_boxes.push_back({renderer.add_box(beam.size), beam.center, appearance.mount});
+      camera_boxes.push_back({renderer.add_box(beam.size), Pose(Eigen::Translation3d(beam.center)),
+                              appearance.mount});
     add_camera_body();
     box({{0, 0, kFloorHeight - 0.05}, {8, 8, 0.1}}, appearance.floor);
   }
@@ -240,9 +241,8 @@ struct SimulatedCell::Impl {
       link_visuals.push_back(
           {d.link, d.T_link_visual, renderer.add_instance(d.mesh, d.material, Pose::Identity())});
     for (std::size_t i = 0; i < boxes.size(); ++i) {
-      Pose T = Pose::Identity();
-      T.translation() = boxes[i].center;
-      const int instance = renderer.add_instance(boxes[i].mesh, boxes[i].material, T);
+      const int instance =
+          renderer.add_instance(boxes[i].mesh, boxes[i].material, boxes[i].T_base_box);
       if (i == 0) table_instance = instance;
     }
     camera_instances.clear();
@@ -267,10 +267,8 @@ struct SimulatedCell::Impl {
     Eigen::Vector3d size = c.body_size, center = c.body_center;
     size.x() = front - back;
     center.x() = (front + back) / 2;
-    // Axes of camera_link are right angles of the base's (camera.yaml looks straight down), so the
-    // body is drawn as a box of base_link like the beams.
-    const Pose T = c.T_base_camera_link();
-    camera_boxes.push_back({renderer.add_box((T.linear() * size).cwiseAbs()), T * center,
+    camera_boxes.push_back({renderer.add_box(size),
+                            c.T_base_camera_link() * Pose(Eigen::Translation3d(center)),
                             appearance.camera});
   }
 
@@ -278,8 +276,7 @@ struct SimulatedCell::Impl {
   void place_camera() {
     const Pose moved = camera.T_base_color * config.camera.T_base_color.inverse();
     for (std::size_t i = 0; i < camera_boxes.size(); ++i)
-      renderer.set_pose(camera_instances[i],
-                        moved * Pose(Eigen::Translation3d(camera_boxes[i].center)));
+      renderer.set_pose(camera_instances[i], moved * camera_boxes[i].T_base_box);
   }
 
   void sync() {
@@ -302,7 +299,7 @@ struct SimulatedCell::Impl {
   };
   struct BoxDrawing {
     int mesh;
-    Eigen::Vector3d center;
+    Pose T_base_box;
     sensing::Material material;
   };
 

@@ -22,6 +22,8 @@ struct SceneSpec {
   double min_gap = 0.0;               // m, scattered: between the parts' outlines
   Eigen::Vector2d drop_area{0, 0};    // m, stacked: extents around the workspace centre
   double drop_height = 0.0;           // m, stacked: above what lies there
+  double drop_interval = 0.30;        // s, stacked: between two drops
+  double settle_time = 12.0;          // s a scene may take to come to rest
 };
 
 std::vector<std::string> scene_names(const std::string& config_dir);

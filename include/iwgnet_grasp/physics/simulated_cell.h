@@ -47,8 +47,8 @@ class SimulatedCell {
   cv::Mat color();          // CV_8UC3 RGB
   cv::Mat depth();          // CV_32FC1 m, depth frame, NaN invalid
   cv::Mat aligned_depth(const cv::Mat& depth) const;  // in the colour frame
-  // The camera that the images are taken with; config().camera until set. The scene's own
-  // geometry (body, mount) stays.
+  // The camera that the images are taken with; config().camera until set. Its body and mount are
+  // drawn where it is, the physics keeps them where config() says.
   const CameraConfig& camera() const;
   void set_camera(const CameraConfig& camera);
 
@@ -63,6 +63,8 @@ class SimulatedCell {
   // Pixels that each part would cover in the colour image with nothing before it (its outline
   // within the image), counted at a quarter of the resolution.
   std::vector<double> unoccluded_areas();
+  // Moves a part into a slot of the tray at once: for data of half-cleared tables, not for trials.
+  void lay_in_tray(int part, int slot);
   void show_parts(bool shown);            // to the camera; the physics keeps them
   void set_light(const sensing::Light& light);
   void set_part_material(int part, const sensing::Material& material);

@@ -7,8 +7,10 @@
 
 Both depths of a crop are the merged depth of the paper (section 4.2): the object's box pasted into
 the depth of the empty table, once noise-free (perfect) and once as the D455 measures it (stereo).
-A scene is a function of (seed, its number) alone and appears whole or not at all, so that a run
-can be stopped and gone on with, on any number of workers.
+Scenes come in piles of LOOKS: the settled parts, then looks at the same table half cleared, as a
+robot sees it, each with its own light, materials and camera. A pile is a function of (seed, its
+number) alone and a scene appears whole or not at all, so that a run can be stopped and gone on
+with, on any number of workers.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -29,6 +32,7 @@ import cv2
 import numpy as np
 import typer
 import yaml
+from PIL import Image
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
@@ -37,16 +41,17 @@ from iwgnet_grasp.data.jacquard import format_grasps
 PACKAGE = Path(__file__).resolve().parents[3]
 CONFIG = PACKAGE / "config" / "dataset.yaml"
 CROP_PX = 300  # side of a crop: the longest part is about 170 px at 0.6 m
-DEPTH_STEP = 2.0**-16  # m: 15 um, far below the noise; the rounded floats compress to a third
-SCENE_ATTEMPTS = 5  # with other draws, when a scene does not come to rest in the workspace
+DEPTH_STEP = 2.0**-15  # m: 31 um, far below the noise; rounded floats compress well
+LOOKS = 3  # scenes of one pile
+PILE_ATTEMPTS = 5  # with other draws, when a pile cannot be built
 
 
 # One scene ------------------------------------------------------------------------------------
 
 
-def scene_rng(seed: int, scene: int, attempt: int = 0) -> np.random.Generator:
-    """The only source of chance of a scene."""
-    return np.random.default_rng([seed, scene, attempt])
+def pile_rng(seed: int, pile: int, attempt: int = 0) -> np.random.Generator:
+    """The only source of chance of a pile."""
+    return np.random.default_rng([seed, pile, attempt])
 
 
 class SceneMaker:
@@ -61,18 +66,31 @@ class SceneMaker:
         self.cell = _core.SimulatedCell(str(package_dir))
         self.labeler = _core.GraspLabeler(str(package_dir / "config"))
 
-    def make(self, seed: int, scene: int) -> Scene:
-        """Raises DataError when no attempt comes to rest."""
-        for attempt in range(SCENE_ATTEMPTS):
-            rng = scene_rng(seed, scene, attempt)
+    def pile(self, seed: int, pile: int) -> Iterator[Scene]:
+        """The LOOKS scenes of a pile. Raises DataError when no attempt can be built."""
+        for attempt in range(PILE_ATTEMPTS):
+            rng = pile_rng(seed, pile, attempt)
             try:
                 self.cell.build_scene(self.spec(rng), int(rng.integers(2**62)))
+                break
             except self.core.CoreError as error:
                 reason = str(error)
-                continue
+        else:
+            raise DataError(f"pile {pile} of seed {seed}: {reason}")
+        left = list(range(len(self.cell.part_names)))
+        slot = 0
+        for look in range(LOOKS):
+            if look:
+                # A few parts go; at least one stays.
+                for _ in range(int(rng.integers(1, max(len(left) // LOOKS, 1) + 1))):
+                    if len(left) > 1:
+                        gone = left.pop(int(rng.integers(len(left))))
+                        self.cell.lay_in_tray(gone, slot)
+                        slot += 1
+                settle = self.settings["scene"]["resettle_time"]
+                self.cell.step(round(settle / self.cell.timestep))
             self.dress(rng)
-            return self.observe(rng)
-        raise DataError(f"scene {scene} of seed {seed}: {reason}")
+            yield self.observe(rng)
 
     def spec(self, rng: np.random.Generator) -> Any:
         s = self.settings["scene"]
@@ -86,6 +104,8 @@ class SceneMaker:
             min_gap=rng.uniform(*s["min_gap"]),
             drop_area=np.full(2, rng.uniform(*s["drop_area"])),
             drop_height=s["drop_height"],
+            drop_interval=s["drop_interval"],
+            settle_time=s["settle_time"],
         )
 
     def dress(self, rng: np.random.Generator) -> None:
@@ -311,12 +331,11 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def write_depth(path: Path, depth: np.ndarray) -> None:
-    """TIFF float32 m; -1 where there is no depth (Jacquard's mark)."""
+    """TIFF float32 m; -1 where there is no depth (Jacquard's mark). OSError when it cannot be
+    written. By Pillow: OpenCV writes float images without compression."""
     rounded = np.round(depth / DEPTH_STEP) * DEPTH_STEP
     stored = np.where(np.isfinite(depth), rounded, -1).astype(np.float32)
-    deflate = 8
-    if not cv2.imwrite(str(path), stored, [cv2.IMWRITE_TIFF_COMPRESSION, deflate]):
-        raise DataError(f"{path}: cannot be written")
+    Image.fromarray(stored).save(path, compression="tiff_lzw")
 
 
 def write_annotations(out: Path, categories: list[str]) -> tuple[int, int]:
@@ -364,10 +383,12 @@ def _start_worker(families: list[str], settings: dict) -> None:
     _maker = SceneMaker(families, settings)
 
 
-def _make(seed: int, number: int, out: Path, crop: dict, categories: list[str]) -> int:
-    scene = _maker.make(seed, number)
-    write_scene(scene, number, out, crop, categories)
-    return len(scene.objects)
+def _make(seed: int, pile: int, wanted: list[int], out: Path, categories: list[str]) -> int:
+    for look, scene in enumerate(_maker.pile(seed, pile)):
+        number = pile * LOOKS + look
+        if number in wanted:
+            write_scene(scene, number, out, _maker.settings["crop"], categories)
+    return len(wanted)
 
 
 def open_dataset(out: Path, description: dict) -> None:
@@ -459,7 +480,10 @@ def _run(
         initializer=_start_worker,
         initargs=(categories, settings),
     )
-    left = iter(missing)
+    piles: dict[int, list[int]] = {}
+    for number in missing:
+        piles.setdefault(number // LOOKS, []).append(number)
+    left = iter(piles.items())
     running: set[Future] = set()
     try:
         with Progress(*columns, disable=quiet) as progress:
@@ -473,8 +497,7 @@ def _run(
                     return
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
-                    future.result()
-                    progress.advance(task)
+                    progress.advance(task, future.result())
     except BrokenProcessPool:
         raise DataError(
             "a worker died (out of memory?); run the same command again to go on"
