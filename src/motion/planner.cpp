@@ -26,6 +26,8 @@ constexpr double kJointLimit = 2 * M_PI;    // rad
 constexpr double kDetour = 1.2;             // rad, how far a path may leave the range of its ends
 constexpr double kRange = 0.8;              // rad, longest step of a tree
 constexpr int kShortcuts = 120;             // attempts
+constexpr int kAttempts = 4;              // at ever smaller steps
+constexpr double kFineCheck = 8;          // times finer than the planner's resolution
 constexpr double kJump = 0.35;              // rad a step: more is another arm configuration
 
 double since(Clock::time_point start) {
@@ -109,6 +111,45 @@ void shorten(JointPath& path, const CollisionWorld& world, const PlannerConfig& 
   }
 }
 
+// Empty when none was found in time.
+JointPath rrt_connect(const CollisionWorld& world, const JointVector& from, const JointVector& to,
+                      const PlannerConfig& config, Clock::time_point start) {
+  ompl::msg::setLogLevel(ompl::msg::LOG_NONE);
+  auto space = std::make_shared<ob::RealVectorStateSpace>(kJoints);
+  ob::RealVectorBounds bounds(kJoints);
+  for (int i = 0; i < kJoints; ++i) {
+    const double limit = i == 2 ? kElbowLimit : kJointLimit;
+    bounds.setLow(i, std::max(-limit - 1e-6, std::min(from[i], to[i]) - kDetour));
+    bounds.setHigh(i, std::min(limit + 1e-6, std::max(from[i], to[i]) + kDetour));
+  }
+  space->setBounds(bounds);
+  space->setStateSamplerAllocator([&](const ob::StateSpace* s) {
+    return std::make_shared<SeededSampler>(s, config.seed);
+  });
+  auto si = std::make_shared<ob::SpaceInformation>(space);
+  si->setStateValidityChecker([&](const ob::State* s) { return !world.collides(joints_of(s)); });
+  si->setMotionValidator(std::make_shared<StraightMotion>(si, world, config.resolution));
+  si->setup();
+  const auto state = [&](const JointVector& q) {
+    ob::ScopedState<> s(space);
+    for (int i = 0; i < kJoints; ++i) s[i] = q[i];
+    return s;
+  };
+  auto problem = std::make_shared<ob::ProblemDefinition>(si);
+  problem->setStartAndGoalStates(state(from), state(to));
+  ompl::geometric::RRTConnect planner(si);
+  planner.setRange(kRange);
+  planner.setProblemDefinition(problem);
+  planner.setup();
+  // A condition of our own: solve(seconds) would start a timer thread.
+  const ob::PlannerTerminationCondition timeout([&] { return since(start) > config.max_time; });
+  if (planner.solve(timeout) != ob::PlannerStatus::EXACT_SOLUTION) return {};
+  JointPath path;
+  for (ob::State* s : problem->getSolutionPath()->as<ompl::geometric::PathGeometric>()->getStates())
+    path.push_back(joints_of(s));
+  return path;
+}
+
 std::string degrees(const JointVector& q) {
   std::string text;
   for (int i = 0; i < kJoints; ++i)
@@ -151,47 +192,28 @@ PlanResult plan(const CollisionWorld& world, const JointVector& from, const Join
       if (std::abs(q[i]) > (i == 2 ? kElbowLimit : kJointLimit) + 1e-6)
         return finish(std::string("the ") + name + " lies outside the limits of " + kJointNames[i]);
   }
-  if (straight_joint_motion_is_free(world, from, to, config.resolution)) {
+  if (straight_joint_motion_is_free(world, from, to, config.resolution / kFineCheck)) {
     result.path = {from, to};
     return finish("");
   }
 
-  ompl::msg::setLogLevel(ompl::msg::LOG_NONE);
-  auto space = std::make_shared<ob::RealVectorStateSpace>(kJoints);
-  ob::RealVectorBounds bounds(kJoints);
-  for (int i = 0; i < kJoints; ++i) {
-    const double limit = i == 2 ? kElbowLimit : kJointLimit;
-    bounds.setLow(i, std::max(-limit - 1e-6, std::min(from[i], to[i]) - kDetour));
-    bounds.setHigh(i, std::min(limit + 1e-6, std::max(from[i], to[i]) + kDetour));
+  // The tree may pass an edge between two checks: what the fine check refuses is planned again with
+  // smaller steps.
+  PlannerConfig finer = config;
+  for (int attempt = 0; attempt < kAttempts; ++attempt, finer.resolution /= 2, ++finer.seed) {
+    result.path = rrt_connect(world, from, to, finer, start);
+    if (result.path.empty())
+      return finish("no path found within " + std::to_string(config.max_time) + " s from " +
+                    degrees(from) + " to " + degrees(to) + " deg");
+    shorten(result.path, world, finer);
+    bool free = true;
+    for (std::size_t i = 1; free && i < result.path.size(); ++i)
+      free = straight_joint_motion_is_free(world, result.path[i - 1], result.path[i],
+                                           config.resolution / kFineCheck);
+    if (free) return finish("");
   }
-  space->setBounds(bounds);
-  space->setStateSamplerAllocator([&](const ob::StateSpace* s) {
-    return std::make_shared<SeededSampler>(s, config.seed);
-  });
-  auto si = std::make_shared<ob::SpaceInformation>(space);
-  si->setStateValidityChecker([&](const ob::State* s) { return !world.collides(joints_of(s)); });
-  si->setMotionValidator(std::make_shared<StraightMotion>(si, world, config.resolution));
-  si->setup();
-  const auto state = [&](const JointVector& q) {
-    ob::ScopedState<> s(space);
-    for (int i = 0; i < kJoints; ++i) s[i] = q[i];
-    return s;
-  };
-  auto problem = std::make_shared<ob::ProblemDefinition>(si);
-  problem->setStartAndGoalStates(state(from), state(to));
-  ompl::geometric::RRTConnect planner(si);
-  planner.setRange(kRange);
-  planner.setProblemDefinition(problem);
-  planner.setup();
-  // A condition of our own: solve(seconds) would start a timer thread.
-  const ob::PlannerTerminationCondition timeout([&] { return since(start) > config.max_time; });
-  if (planner.solve(timeout) != ob::PlannerStatus::EXACT_SOLUTION)
-    return finish("no path found within " + std::to_string(config.max_time) + " s from " +
-                  degrees(from) + " to " + degrees(to) + " deg");
-  for (ob::State* s : problem->getSolutionPath()->as<ompl::geometric::PathGeometric>()->getStates())
-    result.path.push_back(joints_of(s));
-  shorten(result.path, world, config);
-  return finish("");
+  result.path.clear();
+  return finish("every path found passes too close to an obstacle");
 }
 
 PlanResult plan_straight(const CollisionWorld& world, const JointVector& from, const Pose& T_base_tool0,

@@ -1,0 +1,168 @@
+// Whole picks as planned: every place of the workspace into every slot, within limits, free of
+// collision, part where it belongs; and clear refusals.
+#include <gtest/gtest.h>
+
+#include "iwgnet_grasp/kinematics/robotiq_2f85.h"
+#include "iwgnet_grasp/kinematics/ur5.h"
+#include "iwgnet_grasp/motion/pick_and_place.h"
+
+using namespace iwgnet_grasp;
+using namespace iwgnet_grasp::motion;
+
+namespace {
+
+const std::string kConfigDir = std::string(IWGNET_SOURCE_DIR) + "/config";
+const CellConfig kCell = load_cell_config(kConfigDir);
+const PickPlaceConfig kConfig = load_pick_place_config(kConfigDir);
+
+PickRequest request(double x, double y, double z, double yaw, int slot, double along = 0.02) {
+  PickRequest r;
+  r.grasp.feasible = true;
+  r.grasp.width = 0.02;
+  r.grasp.opening = 0.05;
+  r.grasp.T_base_tcp.linear() = (Eigen::AngleAxisd(yaw, Eigen::Vector3d::UnitZ()) *
+                                 Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX())).toRotationMatrix();
+  r.grasp.T_base_tcp.translation() << x, y, z;
+  r.centroid = r.grasp.T_base_tcp * Eigen::Vector3d(0.0, along, 0.005);
+  r.tray_slot = slot;
+  return r;
+}
+
+Pose tcp(const JointVector& q, double gap) { return kinematics::forward(q) * kinematics::T_tool0_tcp(gap); }
+
+void expect_limits(const Trajectory& trajectory, const JointLimits& limits) {
+  for (const TrajectoryPoint& p : trajectory) {
+    EXPECT_LE((p.qd.cwiseAbs() - limits.max_velocity).maxCoeff(), 1e-9);
+    EXPECT_LE((p.qdd.cwiseAbs() - limits.max_acceleration).maxCoeff(), 1e-9);
+  }
+}
+
+}  // namespace
+
+TEST(PlanPick, ReachesTheWholeWorkspaceAndEverySlot) {
+  PickAndPlace picker(kCell, kConfig);
+  const Eigen::Vector2d step = (kCell.workspace_max - kCell.workspace_min) / 4;
+  int count = 0;
+  for (int ix = 0; ix <= 4; ++ix)
+    for (int iy = 0; iy <= 4; ++iy)
+      for (int turn = 0; turn < 6; ++turn) {
+        const double x = kCell.workspace_min.x() + ix * step.x(), y = kCell.workspace_min.y() + iy * step.y();
+        const double z = count % 2 ? 0.022 : 0.07, yaw = -M_PI / 2 + turn * M_PI / 6;
+        const PickRequest r = request(x, y, z, yaw, count++ % 10);
+        PickPlan plan;
+        const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+        ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+
+        // Grasp: the TCP of the closed gripper, at either wrist turn.
+        const Pose T_grasp = tcp(plan.approach.back().q, r.grasp.width);
+        EXPECT_LT((T_grasp.translation() - r.grasp.T_base_tcp.translation()).norm(), 1e-6);
+        EXPECT_NEAR(std::abs(T_grasp.linear().col(0).dot(r.grasp.T_base_tcp.linear().col(0))), 1.0, 1e-9);
+        // Slot: closing along base x, the part's centroid over the slot's centre.
+        const Pose T_slot = tcp(plan.carry.back().q, r.grasp.width);
+        EXPECT_NEAR(std::abs(T_slot(0, 0)), 1.0, 1e-6);
+        const Eigen::Vector3d centroid = T_slot * (T_grasp.inverse() * r.centroid);
+        const Eigen::Vector3d slot = kCell.tray.slots()[r.tray_slot];
+        EXPECT_LT((centroid - slot).head<2>().norm(), 1e-6);
+        EXPECT_GT(T_slot(2, 3) - kinematics::kPadHeight / 2, kCell.tray.floor_height);
+        // One motion into the next, home at the end.
+        EXPECT_LT((plan.approach.front().q - kCell.observe_joints).norm(), 1e-9);
+        EXPECT_LT((plan.carry.front().q - plan.approach.back().q).norm(), 1e-9);
+        EXPECT_LT((plan.retreat.front().q - plan.carry.back().q).norm(), 1e-9);
+        EXPECT_LT((plan.retreat.back().q - kCell.observe_joints).norm(), 1e-9);
+        expect_limits(plan.approach, kConfig.limits);
+        expect_limits(plan.carry, kConfig.carry);
+        expect_limits(plan.retreat, kConfig.limits);
+      }
+}
+
+TEST(PlanPick, TrajectoriesAreFreeOfCollisionBetweenTheirSamples) {
+  PickAndPlace picker(kCell, kConfig);
+  CollisionWorld world(kCell);
+  for (const double x : {0.36, 0.5, 0.64})
+    for (const int slot : {0, 4, 5, 9}) {
+      const PickRequest r = request(x, -0.1, 0.022, 0.4, slot);
+      PickPlan plan;
+      ASSERT_EQ(picker.plan_pick(kCell.observe_joints, r, plan).reason, PickReason::kSucceeded);
+      const auto expect_free = [&](const Trajectory& t, double gap) {
+        world.set_gripper_gap(gap);
+        for (double time = 0; time < t.back().time; time += 0.001)
+          EXPECT_EQ(world.describe(sample(t, time).q), "");
+      };
+      expect_free(plan.approach, r.grasp.opening);
+      expect_free(plan.carry, r.grasp.width);
+      expect_free(plan.retreat, r.grasp.width + kConfig.release_margin);
+    }
+}
+
+TEST(PlanPick, TheToolIsSlowNearTheTable) {
+  PickAndPlace picker(kCell, kConfig);
+  PickPlan plan;
+  const PickRequest r = request(0.5, 0.0, 0.022, 0.0, 3);
+  ASSERT_EQ(picker.plan_pick(kCell.observe_joints, r, plan).reason, PickReason::kSucceeded);
+  const auto tool_speed = [](const TrajectoryPoint& p) {
+    return (kinematics::jacobian(p.q) * p.qd).head<3>().norm();
+  };
+  for (const TrajectoryPoint& p : plan.approach)
+    if (tcp(p.q, r.grasp.width).translation().z() < 0.022 + kConfig.approach_height / 2) {
+      EXPECT_LE(tool_speed(p), kConfig.approach_speed + 1e-6);
+      // Straight down.
+      EXPECT_LT((tcp(p.q, r.grasp.width).translation() - r.grasp.T_base_tcp.translation()).head<2>().norm(), 0.002);
+    }
+  double fastest = 0;
+  for (const TrajectoryPoint& p : plan.carry) fastest = std::max(fastest, tool_speed(p));
+  EXPECT_GT(fastest, 2 * kConfig.lift_speed);
+}
+
+TEST(PlanPick, KeepsClearOfPartsOnTheWay) {
+  // A pile 100 mm high between the observing pose and the grasp.
+  const PinholeIntrinsics camera = kCell.camera.color;
+  cv::Mat depth(camera.height, camera.width, CV_32FC1, cv::Scalar(0.6));
+  const auto row = [&](double y, double h) { return static_cast<int>(camera.cy - y * camera.fy / (0.6 - h)); };
+  depth.rowRange(row(0.20, 0.1), row(0.10, 0.1)).setTo(0.5);
+  const grasping::HeightMap heights(depth, camera, kCell.camera.T_base_color, kCell);
+  PickAndPlace picker(kCell, kConfig);
+  picker.set_heights(heights);
+  PickPlan plan;
+  const PickRequest r = request(0.5, -0.08, 0.022, 0.0, 3);
+  const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+  ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+  CollisionWorld world(kCell);
+  world.set_heights(heights);
+  world.set_gripper_gap(r.grasp.opening);
+  for (double time = 0; time < plan.approach.back().time; time += 0.002)
+    EXPECT_EQ(world.describe(sample(plan.approach, time).q), "");
+}
+
+TEST(PlanPick, RefusesInOneClearLine) {
+  PickAndPlace picker(kCell, kConfig);
+  PickPlan plan;
+  const auto refuse = [&](PickRequest r, PickReason reason, const std::string& word) {
+    const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+    EXPECT_EQ(result.reason, reason) << result.message;
+    EXPECT_NE(result.message.find(word), std::string::npos) << result.message;
+    EXPECT_EQ(result.message.find('\n'), std::string::npos);
+  };
+  PickRequest r = request(0.5, 0.0, 0.022, 0.0, 0);
+  r.grasp.feasible = false;
+  r.grasp.reason = "no depth";
+  refuse(r, PickReason::kInfeasible, "no depth");
+  r = request(0.5, 0.0, 0.022, 0.0, 0);
+  r.grasp.T_base_tcp.translation().x() = std::nan("");
+  refuse(r, PickReason::kInfeasible, "finite");
+  r = request(0.5, 0.0, 0.022, 0.0, 10);
+  refuse(r, PickReason::kInfeasible, "slot 10");
+  r = request(0.5, 0.0, 0.022, 0.0, 0);
+  r.grasp.opening = 0.2;
+  refuse(r, PickReason::kInfeasible, "2F-85");
+  refuse(request(1.1, 0.0, 0.022, 0.0, 0), PickReason::kUnreachable, "reach");
+  refuse(request(0.5, 0.0, 0.005, 0.0, 0), PickReason::kUnreachable, "table");
+}
+
+TEST(LoadPickPlaceConfig, NamesTheFileAndTheKey) {
+  try {
+    load_pick_place_config("/nonexistent");
+    FAIL();
+  } catch (const Error& error) {
+    EXPECT_NE(std::string(error.what()).find("motion.yaml"), std::string::npos);
+  }
+}
