@@ -25,6 +25,8 @@ constexpr double kCellAngle = 0.13;      // rad, ... and than this are tried onc
 constexpr float kRim = 0.002f;           // m around a pad: a part that bulges there meets its edge
 constexpr float kBulge = 0.0003f;        // m
 constexpr double kSlantShare = 0.5;      // of a face's slant that counts where an edge is gripped
+constexpr double kShift = 0.004;         // m across the closing direction, what may go wrong on the way
+constexpr double kNominalShare = 0.25;   // of the quality that counts at the exact place only
 constexpr int kLineSamples = 15;         // pixels looked at along the closing line
 constexpr double kOwnShare = 0.3;        // least share of them that shows the part
 constexpr double kForeignShare = 0.15;   // most that may show another part
@@ -71,11 +73,13 @@ struct Squeeze {
   double radius;     // m, half the diagonal of the common contact patch
 };
 
-std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose) {
+// shift: m, of the pads across the closing direction.
+std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose, double shift = 0.0) {
   const Eigen::Vector3f along = pose.T_base_tcp.linear().col(0).cast<float>();
   const Eigen::Vector3f across = pose.T_base_tcp.linear().col(1).cast<float>();
   Eigen::Vector3f center = pose.T_base_tcp.translation().cast<float>();
   center.z() = static_cast<float>(pose.tip_height);
+  center += across * static_cast<float>(shift);
   const float half_width = kPadWidth / 2, half_opening = pose.opening / 2;
   thread_local std::vector<std::array<float, 3>> touched;  // along, across, above the tips
   thread_local std::vector<int> index;
@@ -293,7 +297,14 @@ class Labeller {
       if (settled) break;
     }
     if (width < config_.min_width) return {};
-    const double quality = quality_of(contact, label.pose, mass, config_, pose_config_);
+    // A shoulder beside the pads makes a grasp that only works at the exact place.
+    const double exact = quality_of(contact, label.pose, mass, config_, pose_config_);
+    double beside = exact;
+    for (const double shift : {-kShift, kShift}) {
+      const auto shifted = squeeze(posed, label.pose, shift);
+      beside = std::min(beside, shifted ? quality_of(*shifted, label.pose, mass, config_, pose_config_) : 0.0);
+    }
+    const double quality = kNominalShare * exact + (1 - kNominalShare) * beside;
     if (quality < config_.min_quality) return {};
     const double scale = label.rectangle.width_px / label.pose.width;  // px per m at the surface
     label.rectangle.quality = label.pose.quality = quality;

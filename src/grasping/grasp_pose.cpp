@@ -148,7 +148,7 @@ std::string millimetres(double metres) {
 
 struct Descent {
   bool found = false;
-  double tip, contact, opening;  // m: tips' height once closed, gap on the object, gap to approach with
+  double tip, closed, opening;  // m: tips' height once closed, that gap, gap to approach with
 };
 
 // Deepest position of the tips at which both fingers find room.
@@ -158,22 +158,25 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
   const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
+  const int expected = steps(width);
   const Clearance clearance(heights, axes, config, first, widest);
   for (double engaged = config.insertion_depth; engaged >= config.min_engagement - 1e-9;
        engaged -= kStep) {
     const double tip = surface - engaged;
-    if (tip < config.floor_clearance) continue;
+    const auto clear = [&](int gap, int contact) {
+      return clearance.free(0, tip, contact, gap) && clearance.free(1, tip, contact, gap);
+    };
     // Contact: the nearest place to the centre where both fingers stand free.
     int contact = first;
-    while (contact <= widest && !(clearance.free(0, tip, contact, contact) &&
-                                  clearance.free(1, tip, contact, contact)))
-      ++contact;
+    while (contact <= widest && !clear(contact, contact)) ++contact;
+    if (contact > widest) continue;
+    // Beside a shoulder of the object they may still close to the expected width, and sink.
+    const int closed = std::min(contact, expected);
+    const double lowest = tip - (tip_height_at(closed) - tip_height_at(contact));
+    if (lowest < config.floor_clearance) continue;
     int opening = contact;
-    while (opening + 1 <= std::min(widest, contact + margin) &&
-           clearance.free(0, tip, contact, opening + 1) && clearance.free(1, tip, contact, opening + 1))
-      ++opening;
-    if (contact <= widest && opening >= contact + play)
-      return {true, tip, contact * kStep, opening * kStep};
+    while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
+    if (opening >= contact + play) return {true, lowest, closed * kStep, opening * kStep};
   }
   return {};
 }
@@ -271,7 +274,7 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
   if (!descent.found) return infeasible("fingers find no room beside the object");
   const double yaw = std::atan2(axes.along.y(), axes.along.x());
   const double open_tip =
-      descent.tip + finger_tip_height(descent.contact) - finger_tip_height(descent.opening);
+      descent.tip + finger_tip_height(descent.closed) - finger_tip_height(descent.opening);
   // The body is lowest over the scene when the fingers have closed and the tool is at its depth;
   // it does not move between: open tips measure it.
   for (const GripperBody& body : config.body)
@@ -282,7 +285,7 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
   pose.opening = descent.opening;
   pose.tip_height = descent.tip;
   pose.engagement = surface - descent.tip;
-  const double tool_height = descent.tip + finger_tip_height(descent.contact);
+  const double tool_height = descent.tip + finger_tip_height(descent.closed);
   pose.T_base_tcp.translation() << axes.center,
       tool_height - kinematics::pad_center_height(pose.width);
   pose.T_base_tcp.linear().col(0) << axes.along, 0.0;
