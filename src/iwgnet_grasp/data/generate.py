@@ -489,8 +489,8 @@ def _run(
         with Progress(*columns, disable=quiet) as progress:
             task = progress.add_task(f"scenes in {out}", total=len(missing))
             while True:
-                for number in left:
-                    running.add(pool.submit(_make, seed, number, out, settings["crop"], categories))
+                for pile, wanted in left:
+                    running.add(pool.submit(_make, seed, pile, wanted, out, categories))
                     if len(running) >= 2 * workers:
                         break
                 if not running:
