@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -17,19 +16,21 @@ class GraspLoss(NamedTuple):
 def grasp_loss(
     logits: Tensor, labels: Tensor, angle_weight: float = 1.0, width_weight: float = 2.0
 ) -> GraspLoss:
-    """Quality focal loss on Q, smooth L1 on cos, sin and width where a grasp is.
+    """Cross entropy on Q, smooth L1 on cos, sin and width where a grasp is.
 
     logits: [N, 4, H, W] of GraspNetwork.logits. labels: [N, 5, H, W] (q, cos, sin, width, mask).
-    Q: |y - p|^2 * cross entropy with the soft target y (Li et al., 2020), summed over all pixels
-    and divided by the number of grasp pixels, so that the empty table does not drown the object.
-    The background has neither angle nor width.
+    Q: cross entropy with the soft target (its minimum is the target itself, and a grasp of quality
+    0.1 still pulls ten times as hard as one of 0.01), summed over all pixels and divided by the
+    number of grasp pixels, so that it does not depend on how much empty table is seen. The
+    entropy of the target is taken off: a perfect Q costs 0. The background has neither angle nor
+    width.
     """
     target, mask = labels[:, 0], labels[:, 4:5]
     positives = mask.sum().clamp(min=1)
     logit = logits[:, 0].float()
-    entropy = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
-    focus = (target - torch.sigmoid(logit)).square()
-    quality = (focus * entropy).sum() / positives
+    cross_entropy = F.binary_cross_entropy_with_logits(logit, target, reduction="sum")
+    least = F.binary_cross_entropy(target, target, reduction="sum")
+    quality = (cross_entropy - least) / positives
     # The masked maps are zero on both sides where no grasp is.
     double_angle = logits[:, 1:3].float() * mask
     angle = F.smooth_l1_loss(double_angle, labels[:, 1:3], reduction="sum", beta=0.1) / positives
