@@ -14,14 +14,14 @@ constexpr float kMottleTexel = 0.0006f;  // m, of the grain of matt surfaces
 constexpr float kBrushTexel = 0.00025f;  // m, across the brushing of metal ...
 constexpr float kBrushStretch = 24.0f;   // ... and so many times longer along it
 constexpr float kBrushTilt = 0.10f;      // rad, how far brushing tilts the surface
-constexpr float kBrushSpread = 0.18f;    // what brushing too fine to see adds to the highlight's width
+constexpr float kBrushSpread = 0.12f;    // what brushing too fine to see adds to the highlight's width
 constexpr float kMinRoughness = 0.04f;
 constexpr float kDielectricF0 = 0.04f;   // reflectance of plastics and paint seen head-on
-constexpr float kHorizon = 0.55f, kCeiling = 1.05f, kFloor = 0.22f;  // brightness of the room
+constexpr float kHorizon = 0.45f, kCeiling = 1.25f, kFloor = 0.16f;  // brightness of the room
 constexpr float kBlurSigma = 0.6f;       // px, of the lens
 constexpr int kToneSteps = 8192;
 constexpr float kToneRange = 2.0f;       // linear value of the last step
-constexpr float kShoulder = 0.55f;       // linear value from which highlights are compressed
+constexpr float kShoulder = 0.60f;       // linear value from which highlights are compressed
 
 using Texture = std::vector<float>;
 
@@ -185,7 +185,7 @@ Vec3 Lighting::room(const Vec3& direction, float roughness) const {
   const float sharp = (1.0f - roughness) * (1.0f - roughness);
   const float phase = direction.x / std::max(up, 0.25f) * 1.7f;
   const float wave = 1.0f - 4.0f * std::abs(phase - cvFloor(phase) - 0.5f);
-  const float sky = kHorizon + (kCeiling - kHorizon) * up + 0.55f * sharp * wave * up;
+  const float sky = kHorizon + (kCeiling - kHorizon) * up + 0.9f * sharp * wave * up;
   const float s = smoothstep(-blur, blur, direction.z);
   const float value = kFloor + (sky - kFloor) * s;
   return {value * (0.97f + 0.03f * (1 - s)), value, value * (1.0f + 0.05f * s)};
