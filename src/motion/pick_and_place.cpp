@@ -61,6 +61,8 @@ std::string millimetres(const Eigen::Vector3d& p) {
   return text.str();
 }
 
+std::string in_mm(double metres) { return std::to_string(std::lround(metres * 1e3)) + " mm"; }
+
 // A pose over the table or the tray with its straight way up.
 struct Reached {
   JointVector low, high;
@@ -407,7 +409,7 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
   if (!moved.success) return fail(PickReason::kExecutionFailed, "approach: " + moved.message);
 
   if (!begin("grasp")) return fail(PickReason::kExecutionFailed, "cancelled before the grasp");
-  GripResult grip = robot.grip(0.0, force);
+  const GripResult grip = robot.grip(0.0, force);
   const auto let_go = [&] { robot.grip(opening, force); };
   if (!grip.success) {
     let_go();
@@ -415,31 +417,29 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
   }
   if (!held(grip)) {
     let_go();
-    return fail(PickReason::kMissed, "the gripper closed on nothing (gap " +
-                                         std::to_string(std::lround(grip.gap * 1e3)) + " mm)");
+    return fail(PickReason::kMissed, "the gripper closed on nothing (gap " + in_mm(grip.gap) + ")");
   }
 
   if (!begin("lift") || !begin("transfer")) {
     let_go();
     return fail(PickReason::kExecutionFailed, "cancelled before the lift");
   }
-  const double gap = grip.gap;
   moved = move(robot, plan.carry);
   if (!moved.success) {
     put_back(robot, plan, opening);
     return fail(PickReason::kExecutionFailed, "transfer: " + moved.message);
   }
-  grip = robot.grip(0.0, force);  // is it still there?
-  if (!held(grip)) {
+  double gap = robot.gap();  // is it still there?
+  if (std::isnan(gap)) gap = robot.grip(0.0, force).gap;
+  if (gap < config_.held_gap_min) {
     let_go();
-    return fail(PickReason::kLost, "the part left the gripper on the way (gap " +
-                                       std::to_string(std::lround(gap * 1e3)) + " mm, now " +
-                                       std::to_string(std::lround(grip.gap * 1e3)) + " mm)");
+    return fail(PickReason::kLost, "the part left the gripper on the way (gap " + in_mm(grip.gap) +
+                                       " after the grasp, " + in_mm(gap) + " over the tray)");
   }
 
   begin("release");  // a cancelled pick sets the part down first
   const GripResult released =
-      robot.grip(std::min(grip.gap + config_.release_margin, kinematics::max_gap()), force);
+      robot.grip(std::min(gap + config_.release_margin, kinematics::max_gap()), force);
   if (!released.success)
     return fail(PickReason::kExecutionFailed, "the gripper did not let go: " + released.message);
   begin("return");

@@ -10,12 +10,15 @@
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/transform_listener.h>
 
+#include <algorithm>
 #include <atomic>
+#include <limits>
 #include <mutex>
 
 #include "action_call.h"
 #include "camera_transform.h"
 #include "conversions.h"
+#include "iwgnet_grasp/kinematics/robotiq_2f85.h"
 #include "iwgnet_grasp/motion/pick_and_place.h"
 #include "node_setup.h"
 
@@ -28,7 +31,7 @@ using control_msgs::FollowJointTrajectoryAction;
 class RosRobot : public motion::Robot {
  public:
   explicit RosRobot(double held_gap_min)
-      : held_gap_min_(held_gap_min), arm_(Topics::ARM_ACTION, false), gripper_(Topics::GRIP, false) {
+      : held_gap_min_(held_gap_min), arm_(Topics::ARM_ACTION), gripper_(Topics::GRIP) {
     joints_subscriber_ =
         node_.subscribe(Topics::JOINT_STATES, 10, &RosRobot::on_joints, this,
                         ros::TransportHints().tcpNoDelay());
@@ -84,11 +87,16 @@ class RosRobot : public motion::Robot {
   // The arm starts while the gripper still opens; the next grip() takes over from this goal.
   motion::GripResult preset(double gap_m, double force_n) override {
     if (!gripper_.isServerConnected()) return grip(gap_m, force_n);  // which waits and says why not
-    gripper_.sendGoal(goal_for(gap_m));
+    preset_ = gripper_.sendGoal(goal_for(gap_m));
     motion::GripResult result;
     result.success = true;
     result.gap = gap_m;
     return result;
+  }
+
+  double gap() override {
+    const std::lock_guard lock(mutex_);
+    return gap_;
   }
 
  private:
@@ -106,8 +114,13 @@ class RosRobot : public motion::Robot {
 
   void on_joints(const sensor_msgs::JointState::ConstPtr& state) {
     const auto joints = arm_joints(*state);
-    if (!joints) return;  // the gripper's own joint state
     const std::lock_guard lock(mutex_);
+    if (!joints) {  // the gripper's own joint state
+      const auto finger = std::find(state->name.begin(), state->name.end(), "finger_joint");
+      const auto index = static_cast<std::size_t>(finger - state->name.begin());
+      if (index < state->position.size()) gap_ = kinematics::gap_from_joint(state->position[index]);
+      return;
+    }
     joints_ = *joints;
     joints_time_ = ros::WallTime::now();
   }
@@ -118,8 +131,10 @@ class RosRobot : public motion::Robot {
   std::mutex mutex_;
   JointVector joints_ = JointVector::Zero();
   ros::WallTime joints_time_;
-  actionlib::SimpleActionClient<FollowJointTrajectoryAction> arm_;
-  actionlib::SimpleActionClient<GripAction> gripper_;
+  double gap_ = std::numeric_limits<double>::quiet_NaN();  // m; unknown until the gripper reports
+  actionlib::ActionClient<FollowJointTrajectoryAction> arm_;
+  actionlib::ActionClient<GripAction> gripper_;
+  actionlib::ActionClient<GripAction>::GoalHandle preset_;  // dropping it would lose track of it
   GripGoal grip_goal_;
   std::function<bool()> cancelled_;
   bool closed_ = false;

@@ -533,4 +533,14 @@ motion::GripResult SimulatedRobot::grip(double gap_m, double force_n) {
   return result;
 }
 
+motion::GripResult SimulatedRobot::preset(double gap_m, double force_n) {
+  cell_.command_gripper(gap_m, force_n);
+  motion::GripResult result;
+  result.success = true;
+  result.gap = gap_m;
+  return result;
+}
+
+double SimulatedRobot::gap() { return cell_.gripper().gap; }
+
 }  // namespace iwgnet_grasp::physics

@@ -6,6 +6,7 @@
 #pragma once
 
 #include <functional>
+#include <limits>
 #include <optional>
 #include <string>
 
@@ -37,6 +38,8 @@ class Robot {
   // Starts the gripper moving; a robot that can returns at once, so that the arm moves meanwhile.
   // Default: waits.
   virtual GripResult preset(double gap_m, double force_n) { return grip(gap_m, force_n); }
+  // m between the pads now; NaN when the robot cannot tell, and closing again has to.
+  virtual double gap() { return std::numeric_limits<double>::quiet_NaN(); }
 };
 
 struct PickPlaceConfig {  // config/motion.yaml

@@ -83,6 +83,8 @@ class SimulatedRobot : public motion::Robot {
   JointVector joints() override;
   motion::ExecutionResult execute(const motion::Trajectory& trajectory) override;
   motion::GripResult grip(double gap_m, double force_n) override;
+  motion::GripResult preset(double gap_m, double force_n) override;
+  double gap() override;
 
  private:
   SimulatedCell& cell_;
