@@ -203,8 +203,8 @@ class DetectionWindows(Dataset):
             looked_at = (box[:2] + box[2:]) / 2
         else:
             looked_at = rng.uniform((0, 0), (scene_columns, scene_rows))
-        # The point looked at may appear anywhere but at the very edge.
-        place = np.array([columns, rows]) * rng.uniform(0.15, 0.85, 2)
+        # The point looked at may appear anywhere but near the edge, where its object is cut.
+        place = np.array([columns, rows]) * rng.uniform(0.25, 0.75, 2)
         if rows >= scene_rows * zoom and columns >= scene_columns * zoom:
             looked_at = np.array([scene_columns, scene_rows]) / 2  # the whole scene fits
             place = np.array([columns, rows]) * rng.uniform(0.45, 0.55, 2)
