@@ -2,7 +2,7 @@
 // may stand still, the caller may want to give up.
 #pragma once
 
-#include <actionlib/client/simple_action_client.h>
+#include <actionlib/client/action_client.h>
 #include <ros/ros.h>
 
 #include <chrono>
@@ -22,20 +22,22 @@ struct ActionOutcome {
   std::string message;    // why not finished, else what the server said
 };
 
-// Needs a spinner elsewhere. `limit`: ROS time for the goal; `silence`: wall seconds in all after
-// which a server whose clock stands still is given up.
+// Needs a spinner elsewhere. `limit`: ROS time for the goal; `silence`: wall seconds after which a
+// server whose clock stands still is given up. Not SimpleActionClient: a result that comes back
+// before its sendGoal() has returned is lost there.
 template <typename Action>
 ActionOutcome<typename Action::_action_result_type::_result_type> call_action(
-    actionlib::SimpleActionClient<Action>& client, const std::string& name,
+    actionlib::ActionClient<Action>& client, const std::string& name,
     const typename Action::_action_goal_type::_goal_type& goal, ros::Duration limit,
     const std::function<bool()>& cancelled = {}, double silence = 180.0) {
   using Result = typename Action::_action_result_type::_result_type;
+  using Handle = actionlib::ClientGoalHandle<Action>;
   using Clock = std::chrono::steady_clock;
   struct Shared {  // outlives this call if a late result arrives
     std::mutex mutex;
     std::condition_variable changed;
-    bool done = false;
-    actionlib::SimpleClientGoalState state{actionlib::SimpleClientGoalState::PENDING};
+    bool done = false, succeeded = false;
+    std::string text;
     typename Result::ConstPtr result;
   };
   ActionOutcome<Result> outcome;
@@ -54,12 +56,13 @@ ActionOutcome<typename Action::_action_result_type::_result_type> call_action(
   }
 
   const auto shared = std::make_shared<Shared>();
-  client.sendGoal(goal, [shared](const actionlib::SimpleClientGoalState& state,
-                                 const typename Result::ConstPtr& result) {
+  Handle handle = client.sendGoal(goal, [shared](Handle changed) {
+    if (changed.getCommState() != actionlib::CommState::DONE) return;
     const std::lock_guard lock(shared->mutex);
     shared->done = true;
-    shared->state = state;
-    shared->result = result;
+    shared->succeeded = changed.getTerminalState() == actionlib::TerminalState::SUCCEEDED;
+    shared->text = changed.getTerminalState().getText();
+    shared->result = changed.getResult();
     shared->changed.notify_all();
   });
   const ros::Time start = ros::Time::now();
@@ -74,18 +77,19 @@ ActionOutcome<typename Action::_action_result_type::_result_type> call_action(
     else if (!client.isServerConnected())
       outcome.message = "the action server on " + name + " went away";
     else if (ros::Time::now() - start > limit)
-      outcome.message = "no result from " + name + " within " + std::to_string(limit.toSec()) + " s";
+      outcome.message = "no result from " + name + " within " +
+                        std::to_string(static_cast<int>(limit.toSec())) + " s";
     else if (waited() > silence)
       outcome.message = "no result from " + name + ": does its clock stand still?";
     if (!outcome.message.empty()) {
       lock.unlock();
-      client.cancelGoal();
+      handle.cancel();
       return outcome;
     }
   }
   outcome.finished = true;
-  outcome.succeeded = shared->state == actionlib::SimpleClientGoalState::SUCCEEDED;
-  outcome.message = shared->state.getText();
+  outcome.succeeded = shared->succeeded;
+  outcome.message = shared->text;
   if (shared->result) outcome.result = *shared->result;
   return outcome;
 }

@@ -22,7 +22,7 @@ class GripperControl {
  public:
   GripperControl()
       : config_(motion::load_pick_place_config(config_dir())),
-        driver_(Topics::GRIPPER_ACTION, false),
+        driver_(Topics::GRIPPER_ACTION),
         server_(Topics::GRIP, [this](const GripGoalConstPtr& goal) { grip(*goal); }, false) {
     widths_subscriber_ = node_.subscribe(Topics::GRIPPER_WIDTH, 2, &GripperControl::on_widths, this);
     server_.start();
@@ -97,7 +97,7 @@ class GripperControl {
   std::mutex mutex_;
   GripperWidths::ConstPtr widths_;
   ros::Subscriber widths_subscriber_;
-  actionlib::SimpleActionClient<control_msgs::GripperCommandAction> driver_;
+  actionlib::ActionClient<control_msgs::GripperCommandAction> driver_;
   actionlib::SimpleActionServer<GripAction> server_;
 };
 

@@ -30,6 +30,7 @@ from iwgnet_grasp.srv import Capture, Judge, LoadScene
 from scipy import ndimage
 from std_srvs.srv import Trigger
 
+from iwgnet_grasp.ros.action import Goal
 from iwgnet_grasp.ros.messages import image_array
 
 
@@ -62,7 +63,7 @@ class Graph:
         self.widths = Newest(Topics.GRIPPER_WIDTH, GripperWidths)
         self.grasps = rospy.Publisher(Topics.GRASPS, SceneGrasps, queue_size=1, latch=True)
         self.failed = rospy.Publisher(Topics.FAILED_GRASPS, FailedGrasps, queue_size=1, latch=True)
-        self.pick_place = actionlib.SimpleActionClient(Topics.PICK_PLACE, PickPlaceAction)
+        self.pick_place = actionlib.ActionClient(Topics.PICK_PLACE, PickPlaceAction)
         assert self.pick_place.wait_for_server(rospy.Duration(60))
         for service in (Topics.CAPTURE, Topics.LOAD_SCENE, Topics.OBSERVE):
             rospy.wait_for_service(service, 60)
@@ -79,9 +80,9 @@ class Graph:
         return self.scene.wait(lambda m: m.scene_id == answer.scene_id)
 
     def pick(self, scene_id, object_id, slot=0) -> PickPlaceResult:
-        self.pick_place.send_goal(PickPlaceGoal(scene_id, object_id, slot))
-        assert self.pick_place.wait_for_result(rospy.Duration(120))
-        return self.pick_place.get_result()
+        goal = Goal(self.pick_place, PickPlaceGoal(scene_id, object_id, slot))
+        assert goal.done.wait(60), "no result"
+        return goal.result
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def objects_by_depth(scene: Scene) -> SceneGrasps:
                 x_px=u.mean(),
                 y_px=v.mean(),
                 theta_rad=np.arctan(-axis[1] / axis[0]) if axis[0] else np.pi / 2,
-                width_px=40.0,
+                width_px=26.0,
                 quality=0.8,
                 depth_m=float(np.median(depth[v[near], u[near]])),
             )
@@ -218,18 +219,18 @@ def test_unreachable_and_infeasible_grasps_are_refused_and_the_node_goes_on(node
 
 
 def test_the_gripper_refuses_objects_and_gaps_it_does_not_know(nodes):
-    client = actionlib.SimpleActionClient(Topics.GRIP, GripAction)
+    client = actionlib.ActionClient(Topics.GRIP, GripAction)
     assert client.wait_for_server(rospy.Duration(30))
     for goal in (
         GripGoal(command=GripGoal.CLOSE, scene_id=10_000, object_id=1),
         GripGoal(command=GripGoal.RELEASE, gap=0.5),
         GripGoal(command=17),
     ):
-        client.send_goal(goal)
-        assert client.wait_for_result(rospy.Duration(20))
-        assert client.get_state() == actionlib.GoalStatus.ABORTED
-        assert client.get_result().message
-    client.send_goal(GripGoal(command=GripGoal.RELEASE, gap=0.05))
-    assert client.wait_for_result(rospy.Duration(20))
-    assert client.get_result().gap == pytest.approx(0.05, abs=0.002)
-    assert not client.get_result().holding
+        refused = Goal(client, goal)
+        assert refused.done.wait(20)
+        assert refused.status == actionlib.GoalStatus.ABORTED
+        assert refused.result.message
+    opened = Goal(client, GripGoal(command=GripGoal.RELEASE, gap=0.05))
+    assert opened.done.wait(20)
+    assert opened.result.gap == pytest.approx(0.05, abs=0.002)
+    assert not opened.result.holding

@@ -20,6 +20,8 @@ from iwgnet_grasp.srv import Judge, LoadScene, Step
 from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from iwgnet_grasp.ros.action import Goal
+
 JOINTS = [
     "shoulder_pan_joint",
     "shoulder_lift_joint",
@@ -32,7 +34,7 @@ JOINTS = [
 
 @pytest.fixture(scope="module")
 def arm(graph):
-    client = actionlib.SimpleActionClient(Topics.ARM_ACTION, FollowJointTrajectoryAction)
+    client = actionlib.ActionClient(Topics.ARM_ACTION, FollowJointTrajectoryAction)
     assert client.wait_for_server(rospy.Duration(60))
     load("", 0)
     return client
@@ -40,7 +42,7 @@ def arm(graph):
 
 @pytest.fixture(scope="module")
 def gripper(graph):
-    client = actionlib.SimpleActionClient(Topics.GRIPPER_ACTION, GripperCommandAction)
+    client = actionlib.ActionClient(Topics.GRIPPER_ACTION, GripperCommandAction)
     assert client.wait_for_server(rospy.Duration(60))
     return client
 
@@ -69,9 +71,12 @@ def trajectory(target: np.ndarray, seconds: float, names=JOINTS) -> JointTraject
 
 
 def follow(arm, goal: FollowJointTrajectoryGoal):
-    arm.send_goal(goal)
-    assert arm.wait_for_result(rospy.Duration(60))
-    return arm.get_result()
+    return finished(Goal(arm, goal)).result
+
+
+def finished(goal: Goal) -> Goal:
+    assert goal.done.wait(60), "no result"
+    return goal
 
 
 def test_joint_states_come_at_125_hz_of_simulated_time(arm):
@@ -149,10 +154,10 @@ def test_a_malformed_trajectory_is_refused_with_its_code(arm, change, code):
 
 def test_a_cancelled_trajectory_stops_the_arm(arm):
     start = joints()
-    arm.send_goal(FollowJointTrajectoryGoal(trajectory=trajectory(start + 0.5, 60.0)))
+    goal = Goal(arm, FollowJointTrajectoryGoal(trajectory=trajectory(start + 0.5, 60.0)))
     rospy.sleep(2.0)
-    arm.cancel_goal()
-    assert arm.wait_for_result(rospy.Duration(10))
+    goal.cancel()
+    finished(goal)
     stopped = joints()
     rospy.sleep(1.0)
     assert joints() == pytest.approx(stopped, abs=0.01)
@@ -173,9 +178,7 @@ def test_the_gripper_takes_gaps_in_metres(gripper):
     for gap in (0.030, 0.070):
         goal = GripperCommandGoal()
         goal.command.position, goal.command.max_effort = gap, 40.0
-        gripper.send_goal(goal)
-        assert gripper.wait_for_result(rospy.Duration(20))
-        result = gripper.get_result()
+        result = finished(Goal(gripper, goal)).result
         assert result.reached_goal and not result.stalled
         assert result.position == pytest.approx(gap, abs=0.002)
 
@@ -183,9 +186,7 @@ def test_the_gripper_takes_gaps_in_metres(gripper):
 def test_a_gripper_command_that_is_no_number_is_refused(gripper):
     goal = GripperCommandGoal()
     goal.command.position = float("nan")
-    gripper.send_goal(goal)
-    assert gripper.wait_for_result(rospy.Duration(20))
-    assert gripper.get_state() == actionlib.GoalStatus.REJECTED
+    assert finished(Goal(gripper, goal)).status == actionlib.GoalStatus.REJECTED
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from iwgnet_grasp.msg import (
 from iwgnet_grasp.perception.merged_depth import crop_window, metres
 from iwgnet_grasp.perception.types import GraspRectangle, Look, PerceptionError
 from iwgnet_grasp.priority import Ranking
+from iwgnet_grasp.ros.action import Goal
 from iwgnet_grasp.ros.messages import (
     failed_to_message,
     grasp_from_message,
@@ -103,7 +104,7 @@ class RosCell:
             )
             + (((Topics.SCENE, Scene),) if on_plan else ())
         }
-        self._pick_place = actionlib.SimpleActionClient(Topics.PICK_PLACE, PickPlaceAction)
+        self._pick_place = actionlib.ActionClient(Topics.PICK_PLACE, PickPlaceAction)
 
     def wait_until_ready(self, seconds: float = 120.0) -> None:
         """Waits until every node is up and connected. Raises CellError naming what is missing."""
@@ -234,22 +235,19 @@ class RosCell:
         return Plan(scene.scene_id, look, ranking, targets)
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:
-        done = threading.Event()
-        goal = PickPlaceGoal(
-            scene_id=target.scene_id, object_id=target.object_id, tray_slot=tray_slot
+        goal = Goal(
+            self._pick_place,
+            PickPlaceGoal(
+                scene_id=target.scene_id, object_id=target.object_id, tray_slot=tray_slot
+            ),
+            self._notify,
         )
-
-        def on_done(*_: object) -> None:
-            done.set()
-            self._notify()
-
-        self._pick_place.send_goal(goal, done_cb=on_done)
         try:
-            self._wait(done.is_set, 600.0, lambda: f"no result from {Topics.PICK_PLACE}")
+            self._wait(goal.done.is_set, 600.0, lambda: f"no result from {Topics.PICK_PLACE}")
         except BaseException:  # ctrl-C too: the arm must not go on by itself
-            self._pick_place.cancel_goal()
+            goal.cancel()
             raise
-        result = self._pick_place.get_result()
+        result = goal.result
         if result is None:
             raise CellError(f"{Topics.PICK_PLACE} ended without a result; see motion_control's log")
         reason = "" if result.success else _REASONS.get(result.reason, str(result.reason))
