@@ -25,6 +25,7 @@ constexpr double kCellAngle = 0.13;      // rad, ... and than this are tried onc
 constexpr float kRim = 0.002f;           // m around a pad: a part that bulges there meets its edge
 constexpr float kBulge = 0.0003f;        // m
 constexpr double kSlantShare = 0.5;      // of a face's slant that counts where an edge is gripped
+constexpr double kContactSlack = kPadWidth / 2;  // m, contacts may lie beside the pad's middle
 constexpr double kShift = 0.004;         // m across the closing direction, what may go wrong on the way
 constexpr double kNominalShare = 0.25;   // of the quality that counts at the exact place only
 constexpr int kLineSamples = 15;         // pixels looked at along the closing line
@@ -208,7 +209,12 @@ class Labeller {
     posed.com = part.T_base_part.translation();
     posed.area_per_point = static_cast<float>(model.area / std::max<Eigen::Index>(1, model.points.cols()));
     std::vector<GraspLabel> labels;
+    // Farther from the centre of mass than this, quality is below the least in any case.
+    const double farthest = config_.com_scale * std::sqrt(-std::log(std::min(config_.min_quality, 1.0)));
     for (const Candidate& candidate : candidates(model, T)) {
+      const Eigen::Vector2d lever = posed.com.head<2>() - candidate.center;
+      const Eigen::Vector2d& along = candidate.along;
+      if (std::abs(lever.x() * along.y() - lever.y() * along.x()) > farthest + kContactSlack) continue;
       if (!shows(candidate, part.instance, part_of_instance)) continue;
       if (auto label = evaluate(candidate, posed, model.mass)) {
         label->part = index;

@@ -106,13 +106,6 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
   fill_unknown(grid_);
 }
 
-double HeightMap::at(double x, double y) const {
-  const double column = (x - origin_.x()) / resolution_ + 0.5;
-  const double row = (y - origin_.y()) / resolution_ + 0.5;
-  if (!(column >= 0.0 && row >= 0.0 && column < grid_.cols && row < grid_.rows)) return 0.0;
-  return grid_.ptr<float>(static_cast<int>(row))[static_cast<int>(column)];
-}
-
 double HeightMap::max_in(const Eigen::Vector2d& center, double yaw,
                          const Eigen::Vector2d& half) const {
   const Eigen::Vector2d along(std::cos(yaw), std::sin(yaw)), across(-along.y(), along.x());

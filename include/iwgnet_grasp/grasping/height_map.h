@@ -18,7 +18,13 @@ class HeightMap {
   HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,
             const CellConfig& cell, double resolution = 0.002, double border = 0.11);
 
-  double at(double x, double y) const;  // m above base_link's z = 0; 0 outside the map
+  // m above base_link's z = 0; 0 outside the map.
+  double at(double x, double y) const {
+    const double column = (x - origin_.x()) / resolution_ + 0.5;
+    const double row = (y - origin_.y()) / resolution_ + 0.5;
+    if (!(column >= 0.0 && row >= 0.0 && column < grid_.cols && row < grid_.rows)) return 0.0;
+    return grid_.ptr<float>(static_cast<int>(row))[static_cast<int>(column)];
+  }
   // Highest value within an oriented rectangle: centre, yaw, half extents (m).
   double max_in(const Eigen::Vector2d& center, double yaw, const Eigen::Vector2d& half) const;
 
