@@ -11,7 +11,13 @@ from pycocotools import mask as coco_mask
 from typer.testing import CliRunner
 
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.data.generate import CROP_PX, as_detected, bounding_box, generate_dataset
+from iwgnet_grasp.data.generate import (
+    CROP_PX,
+    as_detected,
+    bounding_box,
+    generate_dataset,
+    sole_writer,
+)
 from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, X, Y
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_jacquard
@@ -28,7 +34,9 @@ def dataset(tmp_path_factory):
 
 
 def files(root: Path) -> list[str]:
-    return sorted(str(p.relative_to(root)) for p in root.rglob("*") if p.is_file())
+    return sorted(
+        str(p.relative_to(root)) for p in root.rglob("*") if p.is_file() and p.name != ".lock"
+    )
 
 
 def test_every_crop_has_all_its_files_in_the_agreed_size(dataset):
@@ -120,3 +128,11 @@ def test_detected_boxes_stay_near_the_true_one_and_in_the_image():
         assert box.x >= 0 and box.y >= 0
         assert box.x + box.width <= 1280 and box.y + box.height <= 800
         assert abs(box.x - 2) <= 11 and abs(box.width - 150) <= 24
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path):
+    with (
+        sole_writer(tmp_path),
+        pytest.raises(DataError, match="another run"),
+    ):
+        generate_dataset(1, SEED, tmp_path, ["connecting_rod"], 1, quiet=True)

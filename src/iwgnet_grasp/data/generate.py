@@ -15,7 +15,10 @@ with, on any number of workers.
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import ctypes
+import fcntl
 import json
 import multiprocessing
 import os
@@ -373,11 +376,13 @@ def _replace(path: Path, text: str) -> None:
 
 # The run --------------------------------------------------------------------------------------
 
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _maker: SceneMaker | None = None
 
 
 def _start_worker(families: list[str], settings: dict) -> None:
     global _maker
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)  # no worker outlives the run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the run
     cv2.setNumThreads(1)
     _maker = SceneMaker(families, settings)
@@ -433,19 +438,31 @@ def generate_dataset(
     settings = yaml.safe_load(CONFIG.read_text())
     # Detector classes: connecting_rod first wherever it takes part, then by name.
     categories = sorted(families, key=lambda name: (name != "connecting_rod", name))
-    out.mkdir(parents=True, exist_ok=True)
-    open_dataset(
-        out, {"seed": seed, "scenes": scenes, "families": categories, "settings": settings}
-    )
-    missing = [i for i in range(scenes) if not (out / f"{i:06d}").is_dir()]
-    try:
-        if missing:
-            _run(missing, seed, out, categories, settings, workers, quiet)
-    finally:
-        for rest in out.glob(".*.part"):
-            shutil.rmtree(rest, ignore_errors=True)
-        counts = write_annotations(out, categories)
+    with sole_writer(out):
+        open_dataset(
+            out, {"seed": seed, "scenes": scenes, "families": categories, "settings": settings}
+        )
+        missing = [i for i in range(scenes) if not (out / f"{i:06d}").is_dir()]
+        try:
+            if missing:
+                _run(missing, seed, out, categories, settings, workers, quiet)
+        finally:
+            for rest in out.glob(".*.part"):
+                shutil.rmtree(rest, ignore_errors=True)
+            counts = write_annotations(out, categories)
     return counts
+
+
+@contextlib.contextmanager
+def sole_writer(out: Path) -> Iterator[None]:
+    """Holds the folder's lock. DataError when another run has it."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise DataError(f"{out}: another run is writing it; wait or choose another") from None
+        yield
 
 
 def _run(
@@ -519,6 +536,12 @@ def generate(
 ) -> None:
     """Makes a data set for grasp network and detector in the simulator."""
     names = [name.strip() for name in families.split(",") if name.strip()]
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)  # a shell may have started it with SIGINT ignored
+    signal.signal(signal.SIGTERM, stop)
     try:
         made, crops = generate_dataset(scenes, seed, out, names, workers)
     except DataError as error:
