@@ -21,6 +21,7 @@ constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is whe
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
 constexpr double kFarthestCentroid = 0.08;  // m from the grasp point: half a part; more is an error
+constexpr int kReached = 4;              // configurations kept for a pose, nearest first
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
 
 double seconds_since(Clock::time_point start) {
@@ -70,38 +71,46 @@ struct Reached {
   int turn;      // index of the pose
 };
 
-// All configurations that reach one of the TCP poses and rise from it free of collision in `world`.
-// `why` keeps the reason of the nearest that does not.
+// The configurations nearest to `near` (at most kReached) that reach one of the TCP poses and rise
+// from it free of collision in `world`. When there is none, `why` is the reason of the nearest.
 std::vector<Reached> reach(const CollisionWorld& world, const std::array<Pose, 2>& T_base_tcp,
                            double gap, double height, const JointVector& near,
                            const JointLimits& limits, std::string& why) {
-  std::vector<Reached> found;
-  double nearest_failure = 1e9;
-  const auto failed = [&](const JointVector& q, const std::string& reason) {
-    const double cost = duration(near, q, limits);
-    if (cost < nearest_failure) {
-      nearest_failure = cost;
-      why = reason;
-    }
+  struct Configuration {
+    JointVector q;
+    int turn;
+    double cost;
   };
-  why = "out of the arm's reach";
+  std::array<Pose, 2> T_base_tool0;
+  std::vector<Configuration> configurations;
   for (int turn = 0; turn < 2; ++turn) {
-    const Pose T_tool0 = T_base_tcp[turn] * kinematics::T_tool0_tcp(gap).inverse();
-    const auto solutions = kinematics::inverse(T_tool0, near[5]);
+    T_base_tool0[turn] = T_base_tcp[turn] * kinematics::T_tool0_tcp(gap).inverse();
+    const auto solutions = kinematics::inverse(T_base_tool0[turn], near[5]);
     for (int i = 0; i < solutions.count; ++i) {
       const JointVector q = kinematics::nearest_turn(solutions.q[i], near);
-      const std::string contact = world.describe(q);
-      if (!contact.empty()) {
-        failed(q, "the arm would touch: " + contact);
-        continue;
-      }
-      PlanResult up = plan_straight(world, q, raised(T_tool0, height), true);
-      if (up.success)
-        found.push_back({q, up.path.back(), up.path, turn});
-      else
-        failed(q, up.message);
+      configurations.push_back({q, turn, duration(near, q, limits)});
     }
   }
+  std::sort(configurations.begin(), configurations.end(),
+            [](const auto& a, const auto& b) { return a.cost < b.cost; });
+
+  std::vector<Reached> found;
+  std::string nearest_failure;
+  for (const Configuration& c : configurations) {
+    if (static_cast<int>(found.size()) == kReached) break;
+    std::string failure;
+    if (world.collides(c.q)) {
+      failure = "the arm would touch: " + world.describe(c.q);
+    } else {
+      PlanResult up = plan_straight(world, c.q, raised(T_base_tool0[c.turn], height), true);
+      if (up.success)
+        found.push_back({c.q, up.path.back(), up.path, c.turn});
+      else
+        failure = up.message;
+    }
+    if (nearest_failure.empty()) nearest_failure = failure;
+  }
+  if (found.empty()) why = configurations.empty() ? "out of the arm's reach" : nearest_failure;
   return found;
 }
 

@@ -185,9 +185,8 @@ PlanResult plan(const CollisionWorld& world, const JointVector& from, const Join
   };
   if (!from.allFinite() || !to.allFinite()) return finish("a joint angle is not finite");
   for (const auto& [q, name] : {std::pair{from, "start"}, std::pair{to, "goal"}}) {
-    const std::string contact = world.describe(q);
-    if (!contact.empty())
-      return finish(std::string("the ") + name + " (" + degrees(q) + " deg) collides: " + contact);
+    if (world.collides(q))
+      return finish(std::string("the ") + name + " (" + degrees(q) + " deg) collides: " + world.describe(q));
     for (int i = 0; i < kJoints; ++i)
       if (std::abs(q[i]) > (i == 2 ? kElbowLimit : kJointLimit) + 1e-6)
         return finish(std::string("the ") + name + " lies outside the limits of " + kJointNames[i]);
@@ -250,14 +249,13 @@ PlanResult plan_straight(const CollisionWorld& world, const JointVector& from, c
       best = candidate;
       nearest = &best;
     }
-    const std::string where = std::to_string(std::lround(t * travel.norm() * 1000)) + " mm along the straight motion";
-    if (!nearest) return finish("out of reach " + where);
+    const auto where = [&] {
+      return std::to_string(std::lround(t * travel.norm() * 1000)) + " mm along the straight motion";
+    };
+    if (!nearest) return finish("out of reach " + where());
     if ((best - fine.back()).cwiseAbs().maxCoeff() > kJump)
-      return finish("a singularity " + where + " would turn the arm over");
-    if (check) {
-      const std::string contact = world.describe(best);
-      if (!contact.empty()) return finish("collision " + where + ": " + contact);
-    }
+      return finish("a singularity " + where() + " would turn the arm over");
+    if (check && world.collides(best)) return finish("collision " + where() + ": " + world.describe(best));
     fine.push_back(best);
   }
 
