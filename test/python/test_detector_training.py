@@ -272,7 +272,7 @@ def test_command_writes_weights_that_load_and_a_card(tmp_path, capsys):
         " balance: [4.0, 1.0, 0.4]}\n"
     )
     output = tmp_path / "models" / "tiny.safetensors"
-    train_detector(tmp_path / "set", output, config, tmp_path / "run")
+    train_detector(data=tmp_path / "set", output=output, config=config, run=tmp_path / "run")
     card = read_card(output)
     assert card["network"] == "yolov5s" and card["labels"] == ["connecting_rod"]
     assert card["input"] == [128, 160] and card["parameters"] == 7_022_326

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import logging
 import math
 import time
@@ -28,7 +29,7 @@ from iwgnet_grasp.data.detection import (
     collate,
     load_detection_set,
 )
-from iwgnet_grasp.networks.weights import save_weights
+from iwgnet_grasp.networks.weights import load_state, save_weights
 from iwgnet_grasp.networks.yolov5s import YOLOv5s, decode, non_maximum_suppression
 from iwgnet_grasp.training.detector_loss import LossWeights, detection_loss
 from iwgnet_grasp.training.detector_metrics import ImageBoxes, average_precision
@@ -252,6 +253,7 @@ def fit(
     test: DetectionSet,
     run: Path,
     *,
+    initial: Path | None = None,
     resume: bool = False,
     workers: int = 0,
     devices: int = 1,
@@ -260,7 +262,8 @@ def fit(
     """Trains to the end and returns the module with its averaged weights and last metrics.
 
     run: folder of this run; holds last.ckpt after each epoch, from which `resume` goes on.
-    Raises DetectorTrainingError when there is nothing to resume.
+    initial: weights to begin with instead of random ones. Raises DetectorTrainingError when there
+    is nothing to resume, WeightsError for initial weights of another network or other classes.
     """
     checkpoint = run / "last.ckpt"
     if resume and not checkpoint.is_file():
@@ -268,6 +271,8 @@ def fit(
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     lightning.seed_everything(config.seed, verbose=False)
     module = DetectorTraining(config, len(train.classes))
+    if initial is not None:
+        load_state(module.model, initial, "yolov5s")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         trainer = lightning.Trainer(
@@ -280,9 +285,12 @@ def fit(
             gradient_clip_val=10.0,
             num_sanity_val_steps=0,
             callbacks=[
-                # Not from the first step: the average would long remember the random start.
+                # Not from the first step: the average would long remember the random start. The
+                # batch norms' statistics are averages already, and must follow a change of phase.
                 EMAWeightAveraging(
-                    decay=config.ema_decay, update_starting_at_step=config.warmup_steps
+                    decay=config.ema_decay,
+                    use_buffers=False,
+                    update_starting_at_step=config.warmup_steps,
                 ),
                 ModelCheckpoint(dirpath=run, filename="last", enable_version_counter=False),
             ],
@@ -320,6 +328,9 @@ def train_detector(
     data: Annotated[Path, typer.Option(help="Folder made by 'iwgnet dataset'.")] = Path(
         "data/train"
     ),
+    validation_data: Annotated[
+        Path | None, typer.Option(help="Folder to validate on; by default a share of --data.")
+    ] = None,
     output: Annotated[Path, typer.Option(help="Weight file to write.")] = PACKAGE
     / "models"
     / "yolov5s.safetensors",
@@ -328,6 +339,9 @@ def train_detector(
     / "results"
     / "training"
     / "yolov5s",
+    initial: Annotated[
+        Path | None, typer.Option(help="Weight file to begin with, instead of random weights.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Instead of the config's.")] = None,
     threads: Annotated[int | None, typer.Option(help="CPU threads of torch.")] = None,
     limit: Annotated[int | None, typer.Option(help="At most this many scenes.")] = None,
@@ -336,14 +350,22 @@ def train_detector(
     nodes: Annotated[int, typer.Option(help="Machines of a distributed run.")] = 1,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run folder.")] = False,
 ) -> None:
-    """Train the object detector (YOLOv5s) from scratch and write its weights and card."""
+    """Train the object detector (YOLOv5s) and write its weights and card."""
     settings = DetectorTrainingConfig.load(config)
     if seed is not None:
         settings = replace(settings, seed=seed)
     if threads is not None:
         torch.set_num_threads(threads)
     start = time.monotonic()
-    train, test = load_detection_set(data, settings.input, limit).split(settings.held_out)
+    train = load_detection_set(data, settings.input, limit)
+    if validation_data is None:
+        train, test = train.split(settings.held_out)
+    else:
+        test = load_detection_set(validation_data, settings.input)
+        if test.classes != train.classes:
+            raise DetectorTrainingError(
+                f"{validation_data}: classes {test.classes} differ from the data's {train.classes}"
+            )
     boxes = sum(len(scene.boxes) for scene in train.scenes)
     print(
         f"{len(train.scenes)} scenes with {boxes} boxes to train on, {len(test.scenes)} held out, "
@@ -351,7 +373,15 @@ def train_detector(
         flush=True,
     )
     module = fit(
-        settings, train, test, run, resume=resume, workers=workers, devices=devices, nodes=nodes
+        settings,
+        train,
+        test,
+        run,
+        initial=initial,
+        resume=resume,
+        workers=workers,
+        devices=devices,
+        nodes=nodes,
     )
     if not module.trainer.is_global_zero:
         return
@@ -362,12 +392,15 @@ def train_detector(
         train.classes,
         {
             "data": {
-                "set": Path(data).name,
+                "set": data.name,
+                "validation_set": validation_data.name if validation_data else None,
+                "seed": data_seed(data),
                 "train_scenes": len(train.scenes),
                 "test_scenes": len(test.scenes),
             },
             "training": {
                 **asdict(settings),
+                "initial": initial and initial.name,
                 "steps": settings.steps,
                 "images": sum(p.epochs * p.images for p in settings.phases),
                 "minutes": round((time.monotonic() - start) / 60, 1),
@@ -377,6 +410,14 @@ def train_detector(
         },
     )
     print(f"wrote {path}: mAP50 {module.metrics['map50']:.4f}")
+
+
+def data_seed(folder: Path) -> int | None:
+    """The seed a data set was made with, None where it does not say."""
+    try:
+        return int(json.loads((folder / "dataset.json").read_text())["seed"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def network_input(images: Tensor) -> Tensor:
