@@ -10,6 +10,7 @@ import pytest
 import rospy
 from iwgnet_grasp.msg import Scene, Topics
 from iwgnet_grasp.srv import Capture
+from roslib.packages import find_node
 from sensor_msgs.msg import CameraInfo, Image
 
 from iwgnet_grasp.ros.messages import image_array
@@ -70,8 +71,8 @@ def acquisition(graph):
     names = [Topics.COLOR_IMAGE, Topics.ALIGNED_DEPTH_IMAGE, Topics.COLOR_INFO, Topics.SCENE]
     names.append(Topics.CAPTURE)
     node = subprocess.Popen(
-        ["rosrun", "iwgnet_grasp", "visual_acquisition", "__name:=other_acquisition"]
-        + ["_timeout:=3"]
+        find_node("iwgnet_grasp", "visual_acquisition")[:1]
+        + ["__name:=other_acquisition", "_timeout:=3"]
         + [f"{name}:={prefix}{name}" for name in names],
         env=dict(os.environ),
     )
