@@ -35,11 +35,15 @@ Split = StrEnum("Split", {"object": "object", "image": "image"})
 def train(
     context: typer.Context,
     network: Annotated[NetworkName, typer.Option(help="Which network.")] = NetworkName["iwgnet"],
-    data: Annotated[Path, typer.Option(help="Folder in Jacquard's or Cornell's layout.")] = Path(
-        "data/train"
-    ),
+    data: Annotated[
+        list[Path],
+        typer.Option(help="Folder in Jacquard's or Cornell's layout; give it again for more."),
+    ] = [Path("data/train")],  # noqa: B006
     validation_data: Annotated[
         Path | None, typer.Option(help="Folder to validate on; by default a share of --data.")
+    ] = None,
+    initial: Annotated[
+        str | None, typer.Option(help="Weights to start from: a name in models/ or a path.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the weights and their card.")] = Path(
         "models"
@@ -86,13 +90,14 @@ def train(
         patience=patience,
         seed=seed,
     )
-    typer.echo(f"seed {seed}, network {network.value}, data {data}")
+    typer.echo(f"seed {seed}, network {network.value}, data {', '.join(map(str, data))}")
     weights = train_grasp_network(
         settings,
         data,
         out,
         log_dir,
         validation_data=validation_data,
+        initial=initial,
         resume=resume,
         limit=limit,
         resources=TrainingResources(accelerator, devices, nodes, workers, threads),

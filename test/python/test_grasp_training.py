@@ -93,7 +93,7 @@ def train(data, out, resume=False, **settings):
     chosen = {"epochs": 2, "batch": 8, "input_px": 96} | settings
     return train_grasp_network(
         GraspTrainingSettings(**chosen),
-        data,
+        [data],
         out / "models",
         out / "logs",
         resume=resume,

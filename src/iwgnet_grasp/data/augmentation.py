@@ -13,7 +13,7 @@ class Augmentation:
     """Any rotation and mirroring, and up to the amounts below; heights in network units."""
 
     zoom: float = 0.12  # largest relative change of size
-    shift_px: float = 14.0
+    shift_px: float = 8.0
     noise: float = 0.03  # largest standard deviation of white noise
     tilt: float = 0.05  # largest height of a tilted table at the border
     holes: int = 4  # most patches whose depth is lost and filled from around

@@ -51,12 +51,12 @@ class IWGNet(GraspNetwork):
         self.down_8 = nn.Sequential(
             conv_block(80, 64, stride=2),
             block(64, 32),
-            conv_block(160, 96, dilation=2),
-            block(96, 32),
-            conv_block(192, 96, dilation=4),
+            conv_block(160, 64, dilation=2),
+            block(64, 32),
+            conv_block(160, 64, dilation=4),
         )
         self.lateral_4 = conv_block(80, 48, kernel=1)
-        self.up_4 = _upsample(96, 48, kernel=1)
+        self.up_4 = _upsample(64, 48, kernel=1)
         self.fuse_4 = fusion(48)
         self.smooth_4 = conv_block(48, 48)
         self.up_2 = _upsample(48, 16, kernel=3)

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
-from iwgnet_grasp.networks.weights import load_weights, save_weights
+from iwgnet_grasp.networks.weights import load_state, load_weights, save_weights, weights_path
 from iwgnet_grasp.training.losses import grasp_loss
 from iwgnet_grasp.training.rectangle_metric import any_match
 
@@ -40,7 +41,7 @@ class GraspTrainingSettings:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-4
     warm_up: float = 0.05  # share of the steps
-    input_px: int = 224
+    input_px: int = 176  # the longest rod is 170 px at 0.6 m
     validation: float = 0.1  # share held out of the data when there is no validation folder
     split: str = "object"
     patience: int = 0  # epochs without a better top-1 until training stops; 0: never
@@ -173,16 +174,19 @@ class _Weights(Callback):
 
 def train_grasp_network(
     settings: GraspTrainingSettings,
-    data: Path,
+    data: Sequence[Path],
     out: Path,
     log_dir: Path,
     validation_data: Path | None = None,
+    initial: str | Path | None = None,
     resume: bool = False,
     limit: int = 0,
     resources: TrainingResources | None = None,
     progress: bool = True,
 ) -> Path:
-    """Trains, writes OUT/NETWORK.safetensors and its card, returns the path.
+    """Trains on all folders of `data`, writes OUT/NETWORK.safetensors and its card.
+
+    Returns the path. `initial`: weights of the same network to start from.
 
     DataError names data that cannot be used; ValueError an unknown network or setting. `resume`
     goes on from LOG_DIR/NETWORK/last.ckpt; a run that was killed ends as if it had not been.
@@ -196,7 +200,7 @@ def train_grasp_network(
     if resources.threads:
         torch.set_num_threads(resources.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    samples = find_samples(data)
+    samples = [sample for folder in data for sample in find_samples(folder)]
     if limit:
         samples = samples[:limit]
     if validation_data:
@@ -205,13 +209,17 @@ def train_grasp_network(
         split = SPLITS[settings.split]
         training, held_out = split(samples, settings.validation, settings.seed)
     if not training or not held_out:
-        raise DataError(f"{data}: {len(samples)} samples are too few to train and to validate on")
+        raise DataError(f"{len(samples)} samples are too few to train and to validate on")
     views, held_out_views = load_views(training), load_views(held_out)
     module = GraspTraining(settings, views, held_out_views, resources.workers)
 
     folder = log_dir / settings.network
+    if initial and not resume:
+        load_state(module.network, weights_path(initial), settings.network)
     weights = out / f"{settings.network}.safetensors"
     card = _card(settings, module, data, len(views), validation_data, len(held_out_views))
+    if initial:
+        card["initial_weights"] = weights_path(initial).name
     # Rewritten each epoch; the best weights are kept by _Weights.
     checkpoint = ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False)
     callbacks: list[Callback] = [_Weights(weights, card), checkpoint]
@@ -250,7 +258,7 @@ def train_grasp_network(
 def _card(
     settings: GraspTrainingSettings,
     module: GraspTraining,
-    data: Path,
+    data: Sequence[Path],
     training_count: int,
     validation_data: Path | None,
     validation_count: int,
@@ -267,9 +275,9 @@ def _card(
         },
         "width_reference_px": WIDTH_REFERENCE_PX,
         "data": {
-            "folder": data.name,
+            "folders": [folder.name for folder in data],
             "samples": training_count,
-            "generator": _generator(data),
+            "generator": [_generator(folder) for folder in data],
             "validation_folder": validation_data.name if validation_data else None,
             "validation_samples": validation_count,
         },
