@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -147,7 +148,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         settings = load_settings(PACKAGE / "config", replan=options.replan)
         options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "trial.json").unlink(missing_ok=True)  # an old result must not pass for new
+        # Nothing of an older trial may pass for this one's.
+        (options.out / "trial.json").unlink(missing_ok=True)
+        for name in ("log", "looks"):
+            shutil.rmtree(options.out / name, ignore_errors=True)
         trial = run(options, settings)
     except KeyboardInterrupt:
         print("start_grasping: interrupted; everything is stopped", file=sys.stderr)
