@@ -341,12 +341,15 @@ PickResult PickAndPlace::observe(Robot& robot) {
   world_.set_gripper_gap(kinematics::max_gap());
   world_.set_columns({});
 
-  // Out of contacts straight up first: the fingers may stand around a part.
+  // Near the table the fingers may stand around a part, known or not: straight up first, and farther
+  // while that is in contact.
   PathLeg up, home;
   up.path = {q};
-  if (world_.collides(q)) {
-    for (const double height : {0.05, 0.1, 0.15, 0.25}) {
-      const PlanResult rise = plan_straight(world_, q, raised(kinematics::forward(q), height), false);
+  const Pose T_tool0 = kinematics::forward(q);
+  const bool low = (T_tool0 * kinematics::T_tool0_tcp(0.0)).translation().z() < 2 * config_.approach_height;
+  if (low || world_.collides(q)) {
+    for (const double share : {1.0, 0.5, 1.5, 2.5}) {
+      const PlanResult rise = plan_straight(world_, q, raised(T_tool0, share * config_.approach_height), false);
       if (!rise.success) continue;
       up.path = rise.path;
       if (!world_.collides(rise.path.back())) break;
