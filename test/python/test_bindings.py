@@ -111,9 +111,10 @@ def test_labels_lie_on_the_part_that_they_name(cell):
         r = label.rectangle
         assert 0 < r.quality <= 1 and -math.pi / 2 < r.theta_rad <= math.pi / 2
         assert label.pose.feasible and label.opening_px > r.width_px > 0
-        near = mask[
-            round(r.y_px) - 12 : round(r.y_px) + 13, round(r.x_px) - 12 : round(r.x_px) + 13
-        ]
+        # Across a bore the part is met half a width from the centre.
+        reach = math.ceil(r.width_px / 2) + 2
+        x, y = round(r.x_px), round(r.y_px)
+        near = mask[y - reach : y + reach + 1, x - reach : x + reach + 1]
         assert (near == label.part).any()
         # The closing direction in the image is the gripper's x axis in base_link (y mirrored).
         x_axis = label.pose.T_base_tcp[:2, 0]

@@ -40,6 +40,8 @@ from PIL import Image
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.jacquard import format_grasps
+from iwgnet_grasp.perception.merged_depth import crop_window
+from iwgnet_grasp.perception.types import Box
 
 PACKAGE = Path(__file__).resolve().parents[3]
 CONFIG = PACKAGE / "config" / "dataset.yaml"
@@ -198,8 +200,10 @@ class SceneMaker:
             rows = np.array(
                 [rectangle_row(label) for label in labels if label.part == part], np.float32
             ).reshape(-1, COLUMNS)
-            objects.append(SceneObject(part, family, seen, bounding_box(seen), rows))
-        return Scene(color, ideal, empty_ideal, stereo, empty_stereo, objects, rng)
+            box = bounding_box(seen)
+            detected = as_detected(box, color.shape, self.settings["crop"], rng)
+            objects.append(SceneObject(part, family, seen, box, detected, rows))
+        return Scene(color, ideal, empty_ideal, stereo, empty_stereo, objects)
 
     def visible(self, seen: np.ndarray, outline_area: float) -> np.ndarray | None:
         """The part's mask without crumbs; None when too little of it is seen."""
@@ -222,6 +226,7 @@ class SceneObject:
     family: str
     mask: np.ndarray  # (H, W) bool, what is seen of it
     box: np.ndarray  # (4,) x, y, width, height, px: whole pixels
+    detected: Box  # the same as a detector would give it
     rectangles: np.ndarray  # (n, 6) data.grasp_rectangle, full-image px
 
 
@@ -235,7 +240,6 @@ class Scene:
     stereo: np.ndarray
     empty_stereo: np.ndarray
     objects: list[SceneObject]
-    rng: np.random.Generator
 
 
 def rectangle_row(label: Any) -> list[float]:
@@ -256,10 +260,8 @@ def bounding_box(mask: np.ndarray) -> np.ndarray:
     )
 
 
-def as_detected(box: np.ndarray, image_shape: tuple, crop: dict, rng: np.random.Generator):
+def as_detected(box: np.ndarray, image_shape: tuple, crop: dict, rng: np.random.Generator) -> Box:
     """A box as a detector would give it: shifted and scaled a little, inside the image."""
-    from iwgnet_grasp.perception.types import Box
-
     x, y, width, height = box
     u = x + width / 2 + crop["box_shift_px"] * rng.uniform(-1, 1)
     v = y + height / 2 + crop["box_shift_px"] * rng.uniform(-1, 1)
@@ -273,10 +275,8 @@ def as_detected(box: np.ndarray, image_shape: tuple, crop: dict, rng: np.random.
 # On disk --------------------------------------------------------------------------------------
 
 
-def write_scene(scene: Scene, number: int, out: Path, crop: dict, categories: list[str]) -> None:
+def write_scene(scene: Scene, number: int, out: Path, categories: list[str]) -> None:
     """Writes one scene; its folder is renamed into place when everything else is written."""
-    from iwgnet_grasp.perception.merged_depth import crop_window
-
     images = out / "detector" / "images"
     images.mkdir(parents=True, exist_ok=True)
     write_image(images / f"{number:06d}.png", scene.color[:, :, ::-1])
@@ -286,9 +286,8 @@ def write_scene(scene: Scene, number: int, out: Path, crop: dict, categories: li
     for o in scene.objects:
         if len(o.rectangles) == 0:
             continue  # a part that nothing can be done with: the detector's business only
-        box = as_detected(o.box, scene.color.shape, crop, scene.rng)
-        perfect = crop_window(scene.ideal, scene.empty_ideal, box, CROP_PX)
-        stereo = crop_window(scene.stereo, scene.empty_stereo, box, CROP_PX)
+        perfect = crop_window(scene.ideal, scene.empty_ideal, o.detected, CROP_PX)
+        stereo = crop_window(scene.stereo, scene.empty_stereo, o.detected, CROP_PX)
         window = slice(stereo.y, stereo.y + CROP_PX), slice(stereo.x, stereo.x + CROP_PX)
         rows = o.rectangles.copy()
         rows[:, X] -= stereo.x
@@ -392,7 +391,7 @@ def _make(seed: int, pile: int, wanted: list[int], out: Path, categories: list[s
     for look, scene in enumerate(_maker.pile(seed, pile)):
         number = pile * LOOKS + look
         if number in wanted:
-            write_scene(scene, number, out, _maker.settings["crop"], categories)
+            write_scene(scene, number, out, categories)
     return len(wanted)
 
 
