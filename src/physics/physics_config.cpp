@@ -46,6 +46,9 @@ PhysicsConfig load_physics_config(const std::string& config_dir) {
   c.max_force = positive("gripper.max_force");
   c.position_gain = positive("gripper.position_gain");
   c.drive_inertia = positive("gripper.drive_inertia");
+  c.linkage_inertia = positive("gripper.linkage_inertia");
+  c.pad_stiffness = positive("gripper.pad_stiffness");
+  c.pad_damping = positive("gripper.pad_damping");
   return c;
 }
 

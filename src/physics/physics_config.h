@@ -17,7 +17,8 @@ struct PhysicsConfig {
       structure_friction;
   JointVector torque_limits;
   double bandwidth, max_acceleration;
-  double max_speed, min_speed, min_force, max_force, position_gain, drive_inertia;
+  double max_speed, min_speed, min_force, max_force, position_gain, drive_inertia,
+      linkage_inertia, pad_stiffness, pad_damping;
 };
 
 PhysicsConfig load_physics_config(const std::string& config_dir);  // Throws Error.

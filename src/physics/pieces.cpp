@@ -7,7 +7,9 @@
 #include <BulletCollision/NarrowPhaseCollision/btGjkEpaPenetrationDepthSolver.h>
 #include <BulletCollision/NarrowPhaseCollision/btGjkPairDetector.h>
 #include <BulletCollision/NarrowPhaseCollision/btPersistentManifold.h>
+#include <BulletCollision/NarrowPhaseCollision/btPolyhedralContactClipping.h>
 #include <BulletCollision/NarrowPhaseCollision/btVoronoiSimplexSolver.h>
+#include <BulletCollision/CollisionShapes/btPolyhedralConvexShape.h>
 #include <BulletDynamics/Featherstone/btMultiBody.h>
 #include <BulletDynamics/Featherstone/btMultiBodyLinkCollider.h>
 
@@ -26,18 +28,21 @@ constexpr double kSameNormal = 0.8;     // cosine: contacts within it share a pa
 constexpr std::size_t kPatches = 6;     // patches of contact between two bodies
 constexpr double kLargerArea = 1.1;     // squared area a fifth point must add to replace another
 
-// What one query of two pieces found.
-struct Touch : btDiscreteCollisionDetectorInterface::Result {
-  bool found = false;
-  btVector3 normal, point;  // on b, world
-  btScalar distance = 0.0;  // m, negative: penetration
+// What a query of two pieces found: the closest point first.
+struct Touches : btDiscreteCollisionDetectorInterface::Result {
+  struct Point {
+    btVector3 normal, point;  // on b, world
+    btScalar distance;        // m, negative: penetration
+  };
+  static constexpr int kMost = 16;
+  Point points[kMost];
+  int count = 0;
+  btScalar offset = 0.0;  // m, to be added to reported distances
+
   void setShapeIdentifiersA(int, int) override {}
   void setShapeIdentifiersB(int, int) override {}
   void addContactPoint(const btVector3& n, const btVector3& p, btScalar d) override {
-    found = true;
-    normal = n;
-    point = p;
-    distance = d;
+    if (count < kMost) points[count++] = {n, p, d + offset};
   }
 };
 
@@ -70,18 +75,20 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
     if (!listed_ || moved(T_a_b, shape_b.radius()) > kNear) {
       list_pairs(pieces_a, pieces_b, T_a_b, slack + kNear);
       for (Pair& pair : pairs_) {
-        Touch touch;
-        query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack + kNear, pair.axis, touch);
-        pair.near = touch.found;
+        Touches touches;
+        query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack + kNear, pair.axis, touches);
+        pair.near = touches.count > 0;
       }
       T_listed_ = T_a_b;
       listed_ = true;
     }
     for (Pair& pair : pairs_) {
       if (!pair.near) continue;
-      Touch touch;
-      query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, pair.axis, touch);
-      if (touch.found) admit(touch, a, b, *result);
+      Touches touches;
+      query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, pair.axis, touches);
+      if (touches.count > 0)
+        clip_faces(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, touches);
+      for (int k = 0; k < touches.count; ++k) admit(touches.points[k], a, b, *result);
     }
     for (auto* patch : patches_) {
       result->setPersistentManifold(patch);
@@ -141,7 +148,7 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
 
   static void query(const PiecesShape::Piece& a, const btTransform& Ta,
                     const PiecesShape::Piece& b, const btTransform& Tb, btScalar slack,
-                    btVector3& axis, Touch& touch) {
+                    btVector3& axis, Touches& touches) {
     btDiscreteCollisionDetectorInterface::ClosestPointInput input;
     input.m_transformA = Ta * a.T_body_piece;
     input.m_transformB = Tb * b.T_body_piece;
@@ -158,10 +165,25 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
     btVoronoiSimplexSolver simplex;
     btGjkEpaPenetrationDepthSolver depth;
     btGjkPairDetector detector(a.shape.get(), b.shape.get(), &simplex, &depth);
-    detector.getClosestPointsNonVirtual(input, touch, nullptr);
+    detector.getClosestPointsNonVirtual(input, touches, nullptr);
     const btVector3& found = detector.getCachedSeparatingAxis();
     const btScalar length = found.length();
     axis = length > SIMD_EPSILON ? (found / length) * Ta.getBasis() : btVector3(0, 0, 0);
+  }
+
+  // The closest point alone holds no face against a face: the same pose gives the same point. Adds
+  // the corners of the area that the two faces share.
+  void clip_faces(const PiecesShape::Piece& a, const btTransform& Ta, const PiecesShape::Piece& b,
+                  const btTransform& Tb, btScalar slack, Touches& touches) {
+    if (!a.polyhedron || !b.polyhedron) return;
+    const Touches::Point closest = touches.points[0];
+    const btScalar margins = a.polyhedron_margin + b.polyhedron_margin;
+    touches.offset = -margins;
+    btPolyhedralContactClipping::clipHullAgainstHull(
+        closest.normal, *a.polyhedron, *b.polyhedron, Ta * a.T_body_piece, Tb * b.T_body_piece,
+        closest.distance + margins, slack + margins, vertices_, more_vertices_, touches);
+    for (int k = 1; k < touches.count; ++k)  // from the polyhedron's face to the rounded surface
+      touches.points[k].point += b.polyhedron_margin * closest.normal;
   }
 
   // The patch that a contact belongs to: one of a like normal, else a fresh one.
@@ -190,7 +212,7 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
 
   // Bullet lets a fifth point always replace one of four, which makes resting bodies shiver:
   // admit it only when it renews one of them, widens the patch or is the deepest.
-  void admit(const Touch& touch, const btCollisionObjectWrapper* a,
+  void admit(const Touches::Point& touch, const btCollisionObjectWrapper* a,
              const btCollisionObjectWrapper* b, btManifoldResult& result) {
     btPersistentManifold* patch = patch_for(touch.normal, a, b);
     if (patch->getNumContacts() == MANIFOLD_CACHE_SIZE) {
@@ -226,6 +248,7 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
 
   std::vector<btPersistentManifold*> patches_;
   std::vector<Pair> pairs_;
+  btVertexArray vertices_, more_vertices_;  // scratch
   bool listed_ = false;
   btTransform T_listed_;
 };
@@ -254,7 +277,17 @@ void PiecesShape::add(std::unique_ptr<btConvexInternalShape> shape,
   addChildShape(T_body_piece, shape.get());
   const btVector3 center = (low + high) / 2, half = (high - low) / 2;
   radius_ = btMax(radius_, center.length() + half.length());
-  pieces_.push_back({std::move(shape), T_body_piece, center, half});
+  Piece piece{nullptr, T_body_piece, center, half};
+  if (shape->isPolyhedral()) {
+    auto& polyhedral = static_cast<btPolyhedralConvexShape&>(*shape);
+    polyhedral.initializePolyhedralFeatures();
+    piece.polyhedron = polyhedral.getConvexPolyhedron();
+    // A box's corners include its margin, a hull's points do not.
+    const bool box = shape->getShapeType() == BOX_SHAPE_PROXYTYPE;
+    piece.polyhedron_margin = box ? 0.0 : shape->getMargin();
+  }
+  piece.shape = std::move(shape);
+  pieces_.push_back(std::move(piece));
 }
 
 PiecesConfiguration::PiecesConfiguration()

@@ -10,6 +10,8 @@
 #include <memory>
 #include <vector>
 
+class btConvexPolyhedron;
+
 namespace iwgnet_grasp::physics {
 
 // The shape of every body here: convex pieces with their bounds. Owns the pieces.
@@ -22,6 +24,8 @@ class PiecesShape : public btCompoundShape {
     std::unique_ptr<btConvexInternalShape> shape;
     btTransform T_body_piece;
     btVector3 center, half;  // m, axis-aligned bounds in the body's frame
+    const btConvexPolyhedron* polyhedron = nullptr;  // its faces, where it has some
+    btScalar polyhedron_margin = 0.0;                // m that the piece is rounded beyond them
   };
   const std::vector<Piece>& pieces() const { return pieces_; }
   btScalar radius() const { return radius_; }  // m, no point lies further from the body's origin

@@ -77,6 +77,13 @@ RobotBody::RobotBody(const RobotModel& model, const PhysicsConfig& config, const
   const auto friction = [&](btCollisionObject& object, const RobotLink& link) {
     object.setFriction(link.pad ? config.pad_friction : config.robot_friction);
     object.setRestitution(config.restitution);
+    if (link.pad) {
+      // Rubber: yields, so that the load spreads over the patch, and shears before it slides. A
+      // rigid pad may carry all its load on one corner and let the part turn about it.
+      object.setContactStiffnessAndDamping(config.pad_stiffness, config.pad_damping);
+      object.setCollisionFlags(object.getCollisionFlags() |
+                               btCollisionObject::CF_HAS_FRICTION_ANCHOR);
+    }
     object.setActivationState(DISABLE_DEACTIVATION);
     tags_.push_back(std::make_unique<Tag>(Tag{link.name, link.rank, -1}));
     object.setUserPointer(tags_.back().get());

@@ -178,6 +178,7 @@ RobotModel::RobotModel(const std::string& urdf_xml, const std::string& package_d
       const bool knuckle = static_cast<int>(i) == finger_ ||
                            (link.mimic == finger_ && link.parent == links_[finger_].parent);
       if (knuckle) inertia += config.drive_inertia * link.axis * link.axis.transpose();
+      else if (link.mimic == finger_) inertia += config.linkage_inertia * link.axis * link.axis.transpose();
       const Principal p = principal_axes(link.mass, link.com, inertia);
       link.T_link_principal = p.T_body_principal;
       link.inertia = p.moments.asDiagonal();
