@@ -6,7 +6,6 @@ Exit status: 0 success by the judge (on a real cell: by the robot's own word), 1
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import os
 import shutil
 import signal
@@ -14,10 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from iwgnet_grasp.report.pictures import write_pictures
 from iwgnet_grasp.ros.session import Session
 from iwgnet_grasp.supervisor import CellError, Settings, load_settings
-from iwgnet_grasp.trials.in_process import Plan
+from iwgnet_grasp.trials.pictures import Pictures
 from iwgnet_grasp.trials.record import Trial, run_trial, summary_line, write_json
 
 PACKAGE = Path(__file__).resolve().parents[3]
@@ -88,34 +86,6 @@ def _on_graph(
     finally:
         rospy.signal_shutdown("the trial is over")
         pictures.finish()
-
-
-class Pictures:
-    """The paper's Figures 6-9: of the first look in the folder itself, of the later ones below
-    looks/. Drawn beside the trial, which does not wait for them."""
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._thread = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="pictures")
-        self._looks = 0
-
-    def draw(self, plan: Plan) -> None:
-        self._looks += 1
-        folder, prefix = self._out, ""
-        if self._looks > 1:
-            folder, prefix = self._out / "looks", f"{self._looks:02d}_"
-        chosen = {t.object_id: t.grasp for t in plan.targets if t.feasible}
-        self._thread.submit(_draw, folder, plan, chosen, prefix)
-
-    def finish(self) -> None:
-        self._thread.shutdown()
-
-
-def _draw(folder: Path, plan: Plan, chosen: dict, prefix: str) -> None:
-    try:
-        write_pictures(folder, plan.look, plan.ranking, chosen, prefix)
-    except Exception as error:  # a picture less must not cost the trial
-        print(f"start_grasping: pictures of look {plan.scene_id}: {error}", file=sys.stderr)
 
 
 def _ask(prompt: str) -> None:

@@ -50,13 +50,12 @@ class InProcessCell:
         perception: Perceives,
         package_dir: Path = PACKAGE,
         config_dir: Path | None = None,
-        on_plan: Callable[[Plan], None] | None = None,
     ) -> None:
         core = _core()
         config_dir = config_dir or package_dir / "config"
         self._core = core
         self._perception = perception
-        self._on_plan = on_plan
+        self.on_plan: Callable[[Plan], None] | None = None
         self._priority = PriorityConfig.load(config_dir / "priority.yaml")
         self.simulated = core.SimulatedCell(str(package_dir), str(config_dir))
         self._grasp_config = core.load_grasp_pose_config(str(config_dir))
@@ -111,8 +110,8 @@ class InProcessCell:
             Target(scene_id, o.object_id, o.label, o.score, 0.0, None, False, reason)
             for o, reason in ranking.dropped
         ]
-        if self._on_plan is not None:
-            self._on_plan(Plan(scene_id, look, ranking, targets))
+        if self.on_plan is not None:
+            self.on_plan(Plan(scene_id, look, ranking, targets))
         return targets
 
     def _target(self, ranked, intrinsics, camera, heights) -> Target:
@@ -200,9 +199,10 @@ def run(
     perception: Perceives | None = None,
     say: Callable[[str], None] = print,
     cell: InProcessCell | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
 ) -> Trial:
     """One trial; the perception of config/perception.yaml unless another is given. A `cell` is
-    used again, which saves its set-up. Raises CellError, PerceptionError or ValueError for
+    used again, which saves its set-up. on_plan is told all that was made of each look. Raises CellError, PerceptionError or ValueError for
     arguments and files that cannot be used."""
     settings = load_settings(PACKAGE / "config", replan=replan)
     if cell is None:
@@ -211,6 +211,7 @@ def run(
 
             perception = load_perception()
         cell = InProcessCell(perception)
+    cell.on_plan = on_plan
     cell.load(scene, seed)
     return run_trial(
         cell,
@@ -233,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scene", default="five_scattered", help="of config/scenes.yaml")
     parser.add_argument("--seed", type=int, default=0, help="of scene, noise and planner")
     parser.add_argument("--replan", choices=("once", "every"), default="every")
-    parser.add_argument("--out", type=Path, help="folder for trial.json")
+    parser.add_argument("--out", type=Path, help="folder for trial.json and pictures")
     options = parser.parse_args(arguments)
     if options.seed < 0:
         parser.error("--seed must not be negative")
@@ -242,14 +243,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, interrupt)
+    pictures = None
+    if options.out is not None:
+        from iwgnet_grasp.trials.pictures import Pictures
+
+        pictures = Pictures(options.out)
     try:
-        trial = run(options.scene, options.seed, options.replan, options.out)
+        trial = run(
+            options.scene,
+            options.seed,
+            options.replan,
+            options.out,
+            on_plan=pictures.draw if pictures else None,
+        )
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 1
     except (CellError, PerceptionError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    finally:
+        if pictures:
+            pictures.finish()
     print(summary_line(trial))
     return 0 if trial.success else 1
 
