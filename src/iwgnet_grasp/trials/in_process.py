@@ -202,8 +202,9 @@ def run(
     on_plan: Callable[[Plan], None] | None = None,
 ) -> Trial:
     """One trial; the perception of config/perception.yaml unless another is given. A `cell` is
-    used again, which saves its set-up. on_plan is told all that was made of each look. Raises CellError, PerceptionError or ValueError for
-    arguments and files that cannot be used."""
+    used again, which saves its set-up. on_plan is told all that was made of each look. Raises
+    CellError, PerceptionError or ValueError for arguments and files that cannot be used.
+    """
     settings = load_settings(PACKAGE / "config", replan=replan)
     if cell is None:
         if perception is None:
