@@ -9,6 +9,7 @@
 #include <BulletCollision/NarrowPhaseCollision/btPersistentManifold.h>
 #include <BulletCollision/NarrowPhaseCollision/btPolyhedralContactClipping.h>
 #include <BulletCollision/NarrowPhaseCollision/btVoronoiSimplexSolver.h>
+#include <BulletCollision/CollisionShapes/btConvexPolyhedron.h>
 #include <BulletCollision/CollisionShapes/btPolyhedralConvexShape.h>
 #include <BulletDynamics/Featherstone/btMultiBody.h>
 #include <BulletDynamics/Featherstone/btMultiBodyLinkCollider.h>
@@ -26,6 +27,7 @@ bool apart(const btVector3& d, const btVector3& reach) {
 constexpr double kNear = 0.002;         // m: pairs of pieces closer than this are looked at each step
 constexpr double kSameNormal = 0.8;     // cosine: contacts within it share a patch
 constexpr std::size_t kPatches = 6;     // patches of contact between two bodies
+constexpr double kFacing = 0.995;       // cosine (6 deg): a face lies against a face
 constexpr double kLargerArea = 1.1;     // squared area a fifth point must add to replace another
 
 // What a query of two pieces found: the closest point first.
@@ -171,12 +173,28 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
     axis = length > SIMD_EPSILON ? (found / length) * Ta.getBasis() : btVector3(0, 0, 0);
   }
 
+  // Cosine between a direction and the outward normal of the face that looks there most.
+  static btScalar facing(const btConvexPolyhedron& polyhedron, const btTransform& T,
+                         const btVector3& direction) {
+    const btVector3 local = direction * T.getBasis();
+    btScalar most = -1.0;
+    for (int k = 0; k < polyhedron.m_faces.size(); ++k) {
+      const btScalar* plane = polyhedron.m_faces[k].m_plane;
+      most = btMax(most, plane[0] * local.x() + plane[1] * local.y() + plane[2] * local.z());
+    }
+    return most;
+  }
+
   // The closest point alone holds no face against a face: the same pose gives the same point. Adds
   // the corners of the area that the two faces share.
   void clip_faces(const PiecesShape::Piece& a, const btTransform& Ta, const PiecesShape::Piece& b,
                   const btTransform& Tb, btScalar slack, Touches& touches) {
     if (!a.polyhedron || !b.polyhedron) return;
     const Touches::Point closest = touches.points[0];
+    // Where edges or corners meet no area is shared, and the closest point says all.
+    if (facing(*a.polyhedron, Ta * a.T_body_piece, -closest.normal) < kFacing ||
+        facing(*b.polyhedron, Tb * b.T_body_piece, closest.normal) < kFacing)
+      return;
     const btScalar margins = a.polyhedron_margin + b.polyhedron_margin;
     touches.offset = -margins;
     btPolyhedralContactClipping::clipHullAgainstHull(

@@ -39,6 +39,7 @@ constexpr int kPlacements = 2000;         // tries to place one part before all 
 constexpr int kLayouts = 50;
 constexpr double kFlatClearance = 0.0005;  // m above the table, scattered parts are let go
 constexpr int kDrops = 12;                // times one part may be dropped again
+constexpr double kReach = 0.08;           // m from a part's centre to its ends
 constexpr double kMaxHeight = 0.11;       // m: the D455 sees nothing nearer than 0.49 m
 
 struct Outline {  // convex outline of a part seen from above, m
@@ -123,6 +124,21 @@ void run_until_rest(World& world, double limit) {
   for (long i = 0; i < steps && !world.parts_at_rest(); ++i) world.step();
 }
 
+// A part may come to lie so that it rocks on and on; that one is dropped again.
+int most_restless(const World& world) {
+  int part = 0;
+  double most = -1.0;
+  for (int k = 0; k < world.part_count(); ++k) {
+    const PartState state = world.part(k);
+    const double speed = state.linear.norm() + kReach * state.angular.norm();
+    if (speed > most) {
+      most = speed;
+      part = k;
+    }
+  }
+  return part;
+}
+
 Eigen::Matrix3d yaw(double angle) {
   return Eigen::AngleAxisd(angle, Eigen::Vector3d::UnitZ()).toRotationMatrix();
 }
@@ -201,6 +217,7 @@ void stack(World& world, const SceneSpec& spec, const CellConfig& cell,
       const Pose T = world.part(k).T_base_part;
       if (!inside(cell, T.translation()) || highest(models[k], T) > kMaxHeight) stray.push_back(k);
     }
+    if (stray.empty() && !world.parts_at_rest()) stray.push_back(most_restless(world));
     if (stray.empty() || drop == kDrops * spec.count) return;
     // One at a time: two dropped into the same place would start inside each other.
     world.set_part_pose(stray.front(), drop_pose(stray.front()));
