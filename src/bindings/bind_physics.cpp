@@ -115,6 +115,9 @@ void bind_physics(py::module_& m) {
           "joint_velocities", [](const SimulatedCell& c) { return c.arm().qd; }, "(6,) rad/s")
       .def_property_readonly(
           "gap", [](const SimulatedCell& c) { return c.gripper().gap; }, "m between the pads")
+      .def_property_readonly(
+          "grip_force", [](const SimulatedCell& c) { return c.gripper().force; },
+          "N, squeezed between the pads by the drive")
       .def("command_gripper", &SimulatedCell::command_gripper, "gap"_a, "force"_a, "m, N")
       .def(
           "color",
@@ -143,6 +146,16 @@ void bind_physics(py::module_& m) {
       .def(
           "verdict", [](const SimulatedCell& c) { return physics::to_json(c.verdict()); },
           "The judge's verdict on the trial so far, JSON.")
+      .def(
+          "contacts",
+          [](SimulatedCell& c) {
+            py::list contacts;
+            for (const physics::Contact& contact : c.world().contacts())
+              contacts.append(
+                  py::make_tuple(contact.a, contact.b, contact.normal_force, contact.point));
+            return contacts;
+          },
+          "Who touches whom: [(name, name, N, point (3,) m in base_link)]; parts are 'part:INDEX'.")
       .def(
           "ideal_depth",
           [](SimulatedCell& c) { return without_gil<float>(c, &SimulatedCell::ideal_depth); },
