@@ -52,7 +52,7 @@ std::vector<JointVector> random_joints(int count) {
   return joints;
 }
 
-void ik_closed_form(const std::string&) {
+void measure_ik_closed_form(const std::string&) {
   std::vector<Pose> poses;
   for (const auto& q : random_joints(10000)) poses.push_back(kinematics::forward(q));
   long solutions = 0;
@@ -64,7 +64,7 @@ void ik_closed_form(const std::string&) {
       std::to_string(static_cast<double>(solutions) / poses.size()) + " solutions a pose");
 }
 
-void ik_kdl(const std::string& package_dir) {
+void measure_ik_kdl(const std::string& package_dir) {
   std::ifstream file(package_dir + "/urdf/cell.urdf");
   const std::string urdf{std::istreambuf_iterator<char>(file), {}};
   const kinematics::KdlChain chain(urdf, "base_link", "tool0");
@@ -84,7 +84,7 @@ void ik_kdl(const std::string& package_dir) {
 }
 
 // Simulated over wall time of physics alone, all parts kept awake, the arm on its way to and fro.
-void physics(const std::string& package_dir) {
+void measure_physics(const std::string& package_dir) {
   physics::SimulatedCell cell(package_dir);
   cell.load_scene("ten_stacked", 0);
   physics::World& world = cell.world();
@@ -111,28 +111,28 @@ void physics(const std::string& package_dir) {
       "arm moving, ten parts awake, 1/480 s, one core");
 }
 
-void depth_frame(const std::string& package_dir) {
+void measure_depth_frame(const std::string& package_dir) {
   physics::SimulatedCell cell(package_dir);
   cell.load_scene("ten_stacked", 0);
   row("depth_frame", median_seconds(30, [&] { cell.depth(); }) * 1e3, "ms",
       "1280x720 with noise, ten parts and arm");
 }
 
-void color_frame(const std::string& package_dir) {
+void measure_color_frame(const std::string& package_dir) {
   physics::SimulatedCell cell(package_dir);
   cell.load_scene("ten_stacked", 0);
   row("color_frame", median_seconds(15, [&] { cell.color(); }) * 1e3, "ms",
       "1280x800 with light and shadow");
 }
 
-void scene(const std::string& package_dir) {
+void measure_scene(const std::string& package_dir) {
   physics::SimulatedCell cell(package_dir);
   std::uint64_t seed = 0;
   row("scene", median_seconds(5, [&] { cell.load_scene("ten_stacked", seed++); }), "s",
       "ten parts dropped and settled");
 }
 
-void planning(const std::string& package_dir) {
+void measure_planning(const std::string& package_dir) {
   const CellConfig cell = load_cell_config(package_dir + "/config");
   motion::CollisionWorld world(cell);
   const auto config = motion::load_pick_place_config(package_dir + "/config").planner;
@@ -154,7 +154,7 @@ void planning(const std::string& package_dir) {
   row("planning", time * 1e3, "ms", success ? "tray to workspace, shortened" : "NOT SOLVED");
 }
 
-void hand_eye(const std::string&) {
+void measure_hand_eye(const std::string&) {
   std::mt19937_64 random(0);
   std::uniform_real_distribution<double> u(-1, 1);
   std::normal_distribution<double> n;
@@ -184,9 +184,10 @@ void hand_eye(const std::string&) {
 
 int main(int argc, char** argv) {
   const std::map<std::string, void (*)(const std::string&)> rows = {
-      {"ik", ik_closed_form},     {"ik_kdl", ik_kdl}, {"physics", physics},
-      {"depth_frame", depth_frame}, {"color_frame", color_frame}, {"scene", scene},
-      {"planning", planning},     {"hand_eye", hand_eye}};
+      {"ik", measure_ik_closed_form},     {"ik_kdl", measure_ik_kdl},
+      {"physics", measure_physics},       {"depth_frame", measure_depth_frame},
+      {"color_frame", measure_color_frame}, {"scene", measure_scene},
+      {"planning", measure_planning},     {"hand_eye", measure_hand_eye}};
   if (argc < 3) {
     std::fprintf(stderr, "usage: core_benchmark PACKAGE_DIR NAME...\n");
     return 2;
