@@ -73,6 +73,7 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
     const btTransform &Ta = a->getWorldTransform(), &Tb = b->getWorldTransform();
     const btTransform T_a_b = Ta.inverseTimes(Tb);
     const btScalar slack = gContactBreakingThreshold;
+    turn_normals(Tb.getBasis());
 
     if (!listed_ || moved(T_a_b, shape_b.radius()) > kNear) {
       list_pairs(pieces_a, pieces_b, T_a_b, slack + kNear);
@@ -112,6 +113,18 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
     bool near;
     btVector3 axis;  // from b to a in a's frame: along it the two were last seen apart
   };
+
+  // Cached points keep their normal in the world, and an anchored one is not replaced while it
+  // holds: without this the normals of a grip would stay behind when the gripper turns.
+  void turn_normals(const btMatrix3x3& rotation) {
+    const btMatrix3x3 turn = rotation * rotation_.transpose();
+    for (auto* patch : patches_)
+      for (int i = 0; i < patch->getNumContacts(); ++i) {
+        btVector3& normal = patch->getContactPoint(i).m_normalWorldOnB;
+        normal = (turn * normal).normalized();
+      }
+    rotation_ = rotation;
+  }
 
   // Bound on the motion of any point of b as seen from a since the pairs were listed.
   btScalar moved(const btTransform& T_a_b, btScalar radius) const {
@@ -269,6 +282,7 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
   btVertexArray vertices_, more_vertices_;  // scratch
   bool listed_ = false;
   btTransform T_listed_;
+  btMatrix3x3 rotation_ = btMatrix3x3::getIdentity();  // of b in the step before
 };
 
 struct CreatePiecesAlgorithm : btCollisionAlgorithmCreateFunc {
