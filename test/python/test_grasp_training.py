@@ -32,7 +32,8 @@ TRUTH = np.array([[100, 100, 0.2, 60, 30, 1], [40, 40, 1.5, 50, 25, 1]], np.floa
         (Grasp(100, 100, 0.2 + np.radians(29), 60, 1), True),
         (Grasp(100, 100, 0.2 + np.radians(31), 60, 1), False),
         (Grasp(140, 100, 0.2, 60, 1), False),
-        (Grasp(100, 100, 0.2, 20, 1), False),  # 20x10 in 60x30 is an IoU of 1/9
+        (Grasp(100, 100, 0.2, 14, 1), False),  # 14 of 60 px is an IoU of 0.23
+        (Grasp(100, 100, 0.2, 16, 1), True),
         (Grasp(100, 100, 0.2, 0, 1), False),
     ],
 )

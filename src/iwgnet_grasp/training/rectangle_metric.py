@@ -21,21 +21,19 @@ IOU_THRESHOLD = 0.25
 ANGLE_THRESHOLD = np.radians(30)
 
 
-def as_rectangle(grasp: Grasp) -> np.ndarray:
-    """Row [6] of a predicted grasp; its jaw is half its opening, as in GG-CNN's evaluation."""
+def matches(grasp: Grasp, truth: np.ndarray) -> bool:
+    """True when IoU > 0.25 and angle within 30 deg hold for one of the rectangles [n, 6].
+
+    The jaw is the gripper's and not predicted: it is taken from the rectangle compared with.
+    """
     row = np.empty(COLUMNS, np.float32)
     row[[X, Y, THETA]] = grasp.x_px, grasp.y_px, grasp.theta_rad
-    row[[OPENING, JAW, QUALITY]] = grasp.width_px, grasp.width_px / 2, grasp.quality
-    return row
-
-
-def matches(grasp: Grasp, truth: np.ndarray) -> bool:
-    """True when IoU > 0.25 and angle within 30 deg hold for one of the rectangles [n, 6]."""
-    row = as_rectangle(grasp)
-    near = angle_between(truth[:, THETA], row[THETA]) <= ANGLE_THRESHOLD
-    reach = np.hypot(truth[:, X] - row[X], truth[:, Y] - row[Y])
-    near &= reach < 0.5 * (truth[:, OPENING] + truth[:, JAW] + row[OPENING] + row[JAW])
-    return any(iou(row, candidate) > IOU_THRESHOLD for candidate in truth[near])
+    row[[OPENING, QUALITY]] = grasp.width_px, grasp.quality
+    for candidate in truth[angle_between(truth[:, THETA], row[THETA]) <= ANGLE_THRESHOLD]:
+        row[JAW] = candidate[JAW]
+        if iou(row, candidate) > IOU_THRESHOLD:
+            return True
+    return False
 
 
 def any_match(grasps: Iterable[Grasp], truth: np.ndarray) -> bool:
