@@ -2,6 +2,8 @@
 
 #include <ros/package.h>
 
+#include <cstdio>
+
 #include "iwgnet_grasp/core/types.h"
 
 namespace iwgnet_grasp::nodes {
@@ -22,10 +24,14 @@ std::string config_dir() {
 int run_node(int argc, char** argv, const std::string& name, const std::function<void()>& body) {
   try {
     ros::init(argc, argv, name);
+    if (!ros::master::check())
+      throw Error("no ROS master at " + ros::master::getURI() + ": start roscore, or roslaunch the "
+                  "node");
     body();
     return 0;
   } catch (const std::exception& error) {
-    ROS_FATAL("%s: %s", name.c_str(), error.what());
+    // Not ROS_FATAL: the last node handle may be gone, and rosconsole with it.
+    std::fprintf(stderr, "[FATAL] %s: %s\n", ros::this_node::getName().c_str(), error.what());
     return 1;
   }
 }

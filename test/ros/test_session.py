@@ -50,8 +50,7 @@ def own_master(monkeypatch):
 
 def test_a_killed_node_is_named_and_nothing_is_left_behind(own_master, tmp_path):
     with Session("simulation.launch", [], tmp_path) as session:
-        # master, rosout, simulator, robot_state_publisher
-        processes = pids(session.log, 4)
+        processes = pids(session.log, 3)  # rosout, simulator, robot_state_publisher
         session.check()
         os.kill(processes["robot_state_publisher"], signal.SIGKILL)
         with pytest.raises(CellError, match="robot_state_publisher died .killed by SIGKILL"):
@@ -62,17 +61,19 @@ def test_a_killed_node_is_named_and_nothing_is_left_behind(own_master, tmp_path)
 
 
 def test_a_node_that_cannot_start_says_why(own_master, tmp_path):
-    with Session("simulation.launch", ["scene:=no_such_scene"], tmp_path) as session:
-        with pytest.raises(CellError, match="simulator died .*no_such_scene.*five_scattered"):
-            for _ in range(300):
-                session.check()
-                time.sleep(0.1)
+    with (
+        pytest.raises(CellError, match="simulator died .*no_such_scene.*five_scattered"),
+        Session("simulation.launch", ["scene:=no_such_scene"], tmp_path) as session,
+    ):
+        for _ in range(300):
+            session.check()
+            time.sleep(0.1)
 
 
 def test_a_launch_that_fails_says_why(own_master, tmp_path):
     with (
-        pytest.raises(CellError, match="no_such_argument"),
-        Session("simulation.launch", ["no_such_argument:=1"], tmp_path) as session,
+        pytest.raises(CellError, match="roslaunch ended: .*no_such.launch"),
+        Session("no_such.launch", [], tmp_path) as session,
     ):
         for _ in range(300):
             session.check()
@@ -92,7 +93,7 @@ def test_a_killed_parent_takes_its_graph_along(own_master, tmp_path):
     while not log.exists():
         assert parent.poll() is None
         time.sleep(0.1)
-    processes = pids(log, 4)
+    processes = pids(log, 3)
     parent.kill()
     parent.wait()
     assert gone(processes)

@@ -15,7 +15,7 @@ import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import urlparse
-from xmlrpc.client import ServerProxy
+from xmlrpc.client import ServerProxy, Transport
 
 from iwgnet_grasp.supervisor import CellError
 
@@ -103,9 +103,9 @@ class Session:
             if name not in self._optional:
                 raise CellError(f"node {name} died ({_ending(int(code))}){_last_words(text, name)}")
         if self._roslaunch.poll() is not None:
-            lines = [line for line in text.splitlines() if line.strip()]
-            why = next((line for line in lines if "rror" in line), lines[-1] if lines else "")
-            raise CellError(f"roslaunch ended: {why.strip()} (see {self.log})")
+            said = re.findall(r"^\w*(?:Exception|Error): (.*)$", text, re.MULTILINE)
+            why = said[0] if said else f"status {self._roslaunch.returncode}"
+            raise CellError(f"roslaunch ended: {why} (see {self.log})")
 
     def __exit__(self, *_: object) -> None:
         with _uninterrupted():
@@ -126,12 +126,23 @@ class Session:
                     time.sleep(0.1)
 
 
+class _ImpatientTransport(Transport):
+    def make_connection(self, host):
+        connection = super().make_connection(host)
+        connection.timeout = 5.0  # s; something that listens need not answer
+        return connection
+
+
+def _proxy(uri: str) -> ServerProxy:
+    return ServerProxy(uri, transport=_ImpatientTransport())
+
+
 def master_runs(uri: str) -> bool:
-    """Whether a ROS master answers at `uri` within a second."""
+    """Whether a ROS master answers at `uri` within seconds."""
     parts = urlparse(uri)
     try:
         socket.create_connection((parts.hostname, parts.port or 80), 1.0).close()
-        code, *_ = ServerProxy(uri).getPid("/iwgnet_grasp")
+        code, *_ = _proxy(uri).getPid("/iwgnet_grasp")
         return code == 1
     except Exception:  # whatever else answers there is no ROS master
         return False
@@ -166,7 +177,7 @@ def _port_for_master(uri: str) -> int:
 
 def _refuse_second_graph(uri: str) -> None:
     """Nodes of one name push each other out of a master."""
-    _, _, (publishers, subscribers, services) = ServerProxy(uri).getSystemState("/iwgnet_grasp")
+    _, _, (publishers, subscribers, services) = _proxy(uri).getSystemState("/iwgnet_grasp")
     nodes = {node for _, names in publishers + subscribers + services for node in names}
     running = sorted(nodes & {"/simulator", "/motion_control", "/visual_acquisition"})
     if running:
