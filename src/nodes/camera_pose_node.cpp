@@ -5,16 +5,18 @@
 #include <tf2_ros/static_transform_broadcaster.h>
 #include <tf2_ros/transform_listener.h>
 
+#include <optional>
+
 #include "conversions.h"
-#include "iwgnet_grasp/core/yaml.h"
 #include "node_setup.h"
 
 namespace iwgnet_grasp::nodes {
 namespace {
 
 // The pose of the colour camera is what is calibrated; the camera's driver knows where the colour
-// imager sits in its body. Throws Error when it does not say so within 30 s.
-Pose T_camera_link_color() {
+// imager sits in its body. Throws Error when it does not say so within 30 s; nullopt when the node
+// is stopped before.
+std::optional<Pose> find_color_imager() {
   tf2_ros::Buffer buffer;
   const tf2_ros::TransformListener listener(buffer);
   const ros::WallTime start = ros::WallTime::now();
@@ -29,7 +31,7 @@ Pose T_camera_link_color() {
     }
     ros::WallDuration(0.02).sleep();
   }
-  throw Error("stopped while waiting for the camera's frames");
+  return std::nullopt;
 }
 
 void publish() {
@@ -40,7 +42,9 @@ void publish() {
   const Pose T_base_color = file.empty()
                                 ? load_cell_config(config_dir()).camera.T_base_color
                                 : load_camera_pose(file);
-  const Pose T_base_camera_link = T_base_color * T_camera_link_color().inverse();
+  const std::optional<Pose> T_camera_link_color = find_color_imager();
+  if (!T_camera_link_color) return;
+  const Pose T_base_camera_link = T_base_color * T_camera_link_color->inverse();
 
   geometry_msgs::TransformStamped transform;
   transform.header.stamp = ros::Time::now();

@@ -82,6 +82,7 @@ class RosCell:
     ) -> None:
         self._simulated = simulated
         self._check = check or functools.partial(check_nodes, _required(simulated))
+        self._check_start = check or (lambda: None)  # nodes register one by one
         self._on_plan = on_plan
         self._changed = threading.Condition()
         self._newest: dict[str, Any] = {}
@@ -130,7 +131,7 @@ class RosCell:
                 return "/clock does not tick"
             return ""
 
-        self._wait(lambda: not missing(), seconds, missing)
+        self._wait(lambda: not missing(), seconds, missing, self._check_start)
 
     def load(self, scene: str, seed: int) -> int:
         """Measures the bare table, then sets up the scene; returns the number of parts."""
@@ -279,8 +280,15 @@ class RosCell:
         with self._changed:
             self._changed.notify_all()
 
-    def _wait(self, done: Callable[[], bool], seconds: float, missing: Callable[[], str]) -> None:
+    def _wait(
+        self,
+        done: Callable[[], bool],
+        seconds: float,
+        missing: Callable[[], str],
+        check: Callable[[], None] | None = None,
+    ) -> None:
         """Until done() is true. Raises CellError after `seconds` or when the graph breaks."""
+        check = check or self._check
         end = time.monotonic() + seconds
         next_check = time.monotonic() + 0.5
         while not done():
@@ -290,7 +298,7 @@ class RosCell:
             if now > end:
                 raise CellError(f"{missing()} after {seconds:.0f} s")
             if now > next_check:
-                self._check()
+                check()
                 next_check = time.monotonic() + 0.5
             with self._changed:
                 self._changed.wait(0.02)
