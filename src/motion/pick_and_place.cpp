@@ -21,6 +21,9 @@ constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is whe
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
 constexpr double kFarthestCentroid = 0.08;  // m from the grasp point: half a part; more is an error
+constexpr double kSlopeReach = 0.030;    // m beside the grasp where the part's slope is measured
+constexpr double kSameSurface = 0.006;   // m, steps of a part's upper side
+constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
 
@@ -147,16 +150,45 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.held_gap_min = positive("held_gap_min");
   config.held_length = positive("held_part.length");
   config.held_radius = positive("held_part.radius");
+  config.held_reach = positive("held_part.reach");
+  config.held_thickness = positive("held_part.thickness");
   config.release_margin = positive("release_margin");
   config.release_height = positive("release_height");
-  config.max_hang = positive("max_hang");
   return config;
 }
 
 PickAndPlace::PickAndPlace(const CellConfig& cell, const PickPlaceConfig& config)
     : cell_(cell), config_(config), world_(cell) {}
 
-void PickAndPlace::set_heights(const grasping::HeightMap& heights) { world_.set_heights(heights); }
+void PickAndPlace::set_heights(const grasping::HeightMap& heights) {
+  heights_ = heights;
+  world_.set_heights(heights);
+}
+
+double PickAndPlace::hang(const Pose& T_base_tcp, const Eigen::Vector3d& centroid) const {
+  const Eigen::Vector3d at = T_base_tcp.translation();
+  const double tip = at.z() - kinematics::kPadHeight / 2;
+  const Eigen::Vector2d along = T_base_tcp.linear().col(1).head<2>().normalized();
+  const auto height = [&](double s) {
+    const Eigen::Vector2d p = at.head<2>() + s * along;
+    return heights_.at(p.x(), p.y());
+  };
+  const double surface = heights_.max_in(at.head<2>(), std::atan2(along.y(), along.x()), {0.006, 0.006});
+  // Slope of the part's upper side, from what is near enough to the grasp's height to belong to it.
+  double ss = 0.0, sh = 0.0;
+  for (double s = 0.004; s <= kSlopeReach; s += 0.002)
+    for (const double side : {-s, s}) {
+      const double rise = height(side) - surface;
+      if (std::abs(rise) > kSameSurface + kSteepest * s) continue;
+      ss += s * s;
+      sh += side * rise;
+    }
+  const double slope = ss > 0.0 ? std::clamp(sh / ss, -kSteepest, kSteepest) : 0.0;
+  const double down = slope > 0 ? -1.0 : 1.0;  // along the part
+  const double reach = config_.held_reach + down * (centroid - at).head<2>().dot(along);
+  const double below = config_.held_thickness + std::abs(slope) * std::max(reach, 0.0) - (surface - tip);
+  return std::clamp(below, 0.0, std::max(tip, 0.0));
+}
 
 Trajectory PickAndPlace::timed(std::vector<PathLeg> legs, std::string& why) const {
   for (const double share : {1.0, 0.5, 0.2, 0.0}) {
@@ -202,9 +234,8 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
     return finish(PickReason::kUnreachable, "grasp at " + millimetres(at) + ": " + why);
 
   // Slot: closing direction along base x, so the grasped rod lies along y; the part's centroid over
-  // the slot's centre. The part reaches no lower below the tips than the table did.
-  const double tip = at.z() - kinematics::kPadHeight / 2;
-  const double hang = std::clamp(tip, 0.0, config_.max_hang);
+  // the slot's centre.
+  const double hang = this->hang(grasp.T_base_tcp, request.centroid);
   Eigen::Vector3d offset = grasp.T_base_tcp.linear().transpose() * (request.centroid - at);
   offset.z() = 0.0;
   if (offset.norm() > kFarthestCentroid) offset *= kFarthestCentroid / offset.norm();

@@ -54,9 +54,10 @@ struct PickPlaceConfig {  // config/motion.yaml
   double grip_force;              // N
   double held_gap_min;            // m, a smaller gap after closing means nothing is held
   double held_length, held_radius;  // m, capsule that stands for a held part
+  double held_reach;              // m from a part's centroid to its far end, at most
+  double held_thickness;          // m, at most
   double release_margin;          // m, fingers open by this much beyond the object
   double release_height;          // m, part's lowest point above the tray floor when letting go
-  double max_hang;                // m, most that a part reaches below the finger tips
 };
 PickPlaceConfig load_pick_place_config(const std::string& config_dir);  // Throws Error.
 
@@ -105,6 +106,10 @@ class PickAndPlace {
   PickResult plan_pick(const JointVector& start, const PickRequest& request, PickPlan& plan);
 
  private:
+  // How far, m, the part that is grasped at the pose reaches below the finger tips: by its thickness
+  // and by the slope of what the heights show along it; no lower than the table. Used to let go of
+  // a tilted part before it meets the tray, and of a flat one not too high.
+  double hang(const Pose& T_base_tcp, const Eigen::Vector3d& centroid) const;
   JointVector start_of(Robot& robot) const;
   ExecutionResult move(Robot& robot, const Trajectory& trajectory);
   // The fastest trajectory along the legs that is free of collision: corners are cut less where
@@ -116,6 +121,7 @@ class PickAndPlace {
   CellConfig cell_;
   PickPlaceConfig config_;
   CollisionWorld world_;
+  grasping::HeightMap heights_;
   std::optional<JointVector> commanded_;  // where the last trajectory ended
 };
 
