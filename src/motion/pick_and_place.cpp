@@ -430,7 +430,6 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
                              const std::function<bool(const std::string&)>& phase) {
   PickPlan plan;
   PickResult result = plan_pick(start_of(robot), request, plan);
-  if (result.reason != PickReason::kSucceeded) return result;
 
   // The failure with the arm brought home; what goes wrong on that way is added to the message.
   const auto fail = [&](PickReason reason, const std::string& message) {
@@ -440,6 +439,7 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
     if (home.reason != PickReason::kSucceeded) result.message += "; " + home.message;
     return result;
   };
+  if (result.reason != PickReason::kSucceeded) return fail(result.reason, result.message);
   const auto begin = [&](const std::string& name) { return !phase || phase(name); };
   const double opening = request.grasp.opening, force = config_.grip_force;
   const auto held = [&](const GripResult& grip) { return grip.success && grip.gap >= config_.held_gap_min; };
