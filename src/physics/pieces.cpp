@@ -85,12 +85,17 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
       T_listed_ = T_a_b;
       listed_ = true;
     }
+    // Rubber lies along an edge as well, however its faces are inclined to the contact.
+    const bool soft = (a->getCollisionObject()->getCollisionFlags() |
+                       b->getCollisionObject()->getCollisionFlags()) &
+                      btCollisionObject::CF_HAS_CONTACT_STIFFNESS_DAMPING;
+    const btScalar facing_needed = soft ? -1.0 : kFacing;
     for (Pair& pair : pairs_) {
       if (!pair.near) continue;
       Touches touches;
       query(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, pair.axis, touches);
       if (touches.count > 0)
-        clip_faces(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, touches);
+        clip_faces(pieces_a[pair.a], Ta, pieces_b[pair.b], Tb, slack, facing_needed, touches);
       for (int k = 0; k < touches.count; ++k) admit(touches.points[k], a, b, *result);
     }
     for (auto* patch : patches_) {
@@ -201,12 +206,12 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
   // The closest point alone holds no face against a face: the same pose gives the same point. Adds
   // the corners of the area that the two faces share.
   void clip_faces(const PiecesShape::Piece& a, const btTransform& Ta, const PiecesShape::Piece& b,
-                  const btTransform& Tb, btScalar slack, Touches& touches) {
+                  const btTransform& Tb, btScalar slack, btScalar facing_needed, Touches& touches) {
     if (!a.polyhedron || !b.polyhedron) return;
     const Touches::Point closest = touches.points[0];
     // Where edges or corners meet no area is shared, and the closest point says all.
-    if (facing(*a.polyhedron, Ta * a.T_body_piece, -closest.normal) < kFacing ||
-        facing(*b.polyhedron, Tb * b.T_body_piece, closest.normal) < kFacing)
+    if (facing(*a.polyhedron, Ta * a.T_body_piece, -closest.normal) < facing_needed ||
+        facing(*b.polyhedron, Tb * b.T_body_piece, closest.normal) < facing_needed)
       return;
     const btScalar margins = a.polyhedron_margin + b.polyhedron_margin;
     touches.offset = -margins;
