@@ -75,13 +75,12 @@ inline JointVector nearest_ik(const Pose& T_base_tool0, const JointVector& refer
 
 // Leads arm and gripper, with the judge watching.
 struct Rig {
-  static constexpr double kYaw = M_PI / 2;  // closes along base y
-
   CellConfig cell = load_cell_config(kConfig);
   World world{cell_urdf(), kSource, cell, kConfig};
   Judge judge{cell, kConfig};
   GripperController gripper;
   JointVector q;
+  double yaw = M_PI / 2;  // rad, of the closing direction: along base y
   Eigen::Vector3d tcp;
   double tcp_gap;  // gap at which `tcp` is the pads' midpoint
 
@@ -89,7 +88,7 @@ struct Rig {
   Rig(const Eigen::Vector3d& point, double gap) : tcp(point), tcp_gap(gap) {
     JointVector reference = cell.observe_joints;
     reference[0] = 0.0;
-    q = nearest_ik(tool_down(point, kYaw, gap), reference);
+    q = nearest_ik(tool_down(point, yaw, gap), reference);
     world.reset(q);
   }
 
@@ -122,10 +121,22 @@ struct Rig {
       if (t < ramp) s = acceleration * t * t / 2;
       else if (t > end - ramp) s = length - acceleration * (end - t) * (end - t) / 2;
       const JointVector next =
-          nearest_ik(tool_down(from + (to - from) * (s / length), kYaw, tcp_gap), q);
+          nearest_ik(tool_down(from + (to - from) * (s / length), yaw, tcp_gap), q);
       step(next, (next - q) / dt);
     }
     tcp = to;
+    hold(0.1);
+  }
+  // Turns the tool about its axis with a minimum-jerk profile.
+  void turn(double angle, double duration) {
+    const double from = yaw, dt = world.timestep();
+    const int steps = static_cast<int>(std::ceil(duration / dt));
+    for (int i = 1; i <= steps; ++i) {
+      const double s = static_cast<double>(i) / steps;
+      yaw = from + angle * s * s * s * (10 + s * (-15 + 6 * s));
+      const JointVector next = nearest_ik(tool_down(tcp, yaw, tcp_gap), q);
+      step(next, (next - q) / dt);
+    }
     hold(0.1);
   }
   Pose tool() const { return kinematics::forward(world.arm().q); }

@@ -189,6 +189,9 @@ TEST(Grip, AFastLiftAndTransferMovesThePartLessThanAMillimetre) {
   check();
   rig.move({0.5, 0.25, 0.22}, 0.5, 4.0);
   check();
+  rig.turn(-M_PI / 2, 0.6);  // contacts must turn with the gripper
+  check();
+  rig.move({0.35, 0.25, 0.22}, 0.5, 4.0);
   rig.hold(1.0);
   check();
   EXPECT_LT(slip, 1e-3);
