@@ -17,7 +17,7 @@ from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX, GraspNetwork
 MODELS = Path(__file__).resolve().parents[3] / "models"
 
 
-class WeightsError(RuntimeError):
+class WeightsError(ValueError):
     """A weight file or card that cannot be used; the message says which and why."""
 
 

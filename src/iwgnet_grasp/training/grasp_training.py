@@ -22,7 +22,13 @@ from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
-from iwgnet_grasp.networks.weights import load_state, load_weights, save_weights, weights_path
+from iwgnet_grasp.networks.weights import (
+    load_state,
+    load_weights,
+    read_card,
+    save_weights,
+    weights_path,
+)
 from iwgnet_grasp.training.losses import grasp_loss
 from iwgnet_grasp.training.rectangle_metric import any_match
 
@@ -219,7 +225,10 @@ def train_grasp_network(
     weights = out / f"{settings.network}.safetensors"
     card = _card(settings, module, data, len(views), validation_data, len(held_out_views))
     if initial:
-        card["initial_weights"] = weights_path(initial).name
+        first = read_card(initial)
+        card["before"] = {
+            key: first.get(key) for key in ("epoch", "steps", "data", "training", "before")
+        }
     # Rewritten each epoch; the best weights are kept by _Weights.
     checkpoint = ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False)
     callbacks: list[Callback] = [_Weights(weights, card), checkpoint]
