@@ -21,7 +21,9 @@ constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is whe
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
 constexpr double kFarthestCentroid = 0.08;  // m from the grasp point: half a part; more is an error
+constexpr double kLengthwise = 0.015;    // m from grasp to centroid along the closing direction: held lengthwise
 constexpr double kSlopeReach = 0.030;    // m beside the grasp where the part's slope is measured
+constexpr double kFarCentroid = 0.020;   // m from the grasp: far enough to give a slope
 constexpr double kSameSurface = 0.006;   // m, steps of a part's upper side
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
@@ -165,10 +167,10 @@ void PickAndPlace::set_heights(const grasping::HeightMap& heights) {
   world_.set_heights(heights);
 }
 
-double PickAndPlace::hang(const Pose& T_base_tcp, const Eigen::Vector3d& centroid) const {
+double PickAndPlace::hang(const Pose& T_base_tcp, const Eigen::Vector2d& along,
+                          const Eigen::Vector3d& centroid) const {
   const Eigen::Vector3d at = T_base_tcp.translation();
   const double tip = at.z() - kinematics::kPadHeight / 2;
-  const Eigen::Vector2d along = T_base_tcp.linear().col(1).head<2>().normalized();
   const auto height = [&](double s) {
     const Eigen::Vector2d p = at.head<2>() + s * along;
     return heights_.at(p.x(), p.y());
@@ -183,11 +185,17 @@ double PickAndPlace::hang(const Pose& T_base_tcp, const Eigen::Vector3d& centroi
       ss += s * s;
       sh += side * rise;
     }
-  const double slope = ss > 0.0 ? std::clamp(sh / ss, -kSteepest, kSteepest) : 0.0;
-  const double down = slope > 0 ? -1.0 : 1.0;  // along the part
-  const double reach = config_.held_reach + down * (centroid - at).head<2>().dot(along);
-  const double below = config_.held_thickness + std::abs(slope) * std::max(reach, 0.0) - (surface - tip);
-  return std::clamp(below, 0.0, std::max(tip, 0.0));
+  const double offset = (centroid - at).head<2>().dot(along);
+  const auto drop = [&](double slope) {  // of the low end below the grasp
+    slope = std::clamp(slope, -kSteepest, kSteepest);
+    const double reach = config_.held_reach + (slope > 0 ? -offset : offset);
+    return std::abs(slope) * std::max(reach, 0.0);
+  };
+  double low = ss > 0.0 ? drop(sh / ss) : 0.0;
+  // A part gripped by its upper end shows its slope only between the grasp and its centroid.
+  if (std::abs(offset) > kFarCentroid && centroid.z() < surface)
+    low = std::max(low, drop((centroid.z() - surface) / offset));
+  return std::clamp(config_.held_thickness + low - (surface - tip), 0.0, std::max(tip, 0.0));
 }
 
 Trajectory PickAndPlace::timed(std::vector<PathLeg> legs, std::string& why) const {
@@ -233,16 +241,21 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   if (grasps.empty())
     return finish(PickReason::kUnreachable, "grasp at " + millimetres(at) + ": " + why);
 
-  // Slot: closing direction along base x, so the grasped rod lies along y; the part's centroid over
-  // the slot's centre.
-  const double hang = this->hang(grasp.T_base_tcp, request.centroid);
+  // Slot: the part's long axis along y, its centroid over the slot's centre. The fingers close across
+  // the long axis, unless they hold the part by its end from both sides along it.
   Eigen::Vector3d offset = grasp.T_base_tcp.linear().transpose() * (request.centroid - at);
   offset.z() = 0.0;
   if (offset.norm() > kFarthestCentroid) offset *= kFarthestCentroid / offset.norm();
+  const bool lengthwise =
+      std::abs(offset.x()) > std::max(kLengthwise, std::abs(offset.y()));
+  const Eigen::Vector2d along =
+      grasp.T_base_tcp.linear().col(lengthwise ? 0 : 1).head<2>().normalized();
+  const double hang = this->hang(grasp.T_base_tcp, along, request.centroid);
   const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
   const auto slot_poses = [&](int grasp_turn) {
     Pose T = Pose::Identity();
     T.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
+    if (lengthwise) T.rotate(Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitZ()));
     std::array<Pose, 2> poses{T, half_turn(T)};
     for (Pose& pose : poses) {
       const Eigen::Vector3d centroid = grasp_turn == 0 ? offset : Eigen::Vector3d(-offset);
@@ -278,9 +291,10 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
             [](const auto& a, const auto& b) { return a.cost < b.cost; });
 
   AttachedPart part;
-  part.a = part.b = Eigen::Vector3d(0, offset.y(), 0);
-  part.a.y() -= std::max(0.0, config_.held_length / 2 - config_.held_radius);
-  part.b.y() += std::max(0.0, config_.held_length / 2 - config_.held_radius);
+  const double half_length = std::max(0.0, config_.held_length / 2 - config_.held_radius);
+  const Eigen::Vector3d half = half_length * (lengthwise ? Eigen::Vector3d::UnitX() : Eigen::Vector3d::UnitY());
+  part.a = offset - half;
+  part.b = offset + half;
   part.radius = config_.held_radius;
 
   const int tries = std::min<int>(kCombinations, static_cast<int>(combinations.size()));
@@ -317,8 +331,8 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
     world_.set_gripper_gap(grasp.width);
     AttachedPart held = part;  // in the TCP frame of this wrist turn
     if (g.turn == 1) {
-      held.a.y() = -held.a.y();
-      held.b.y() = -held.b.y();
+      held.a.head<2>() *= -1.0;
+      held.b.head<2>() *= -1.0;
     }
     world_.set_attached(held);
     world_.set_columns({grasp_column, slot_column});

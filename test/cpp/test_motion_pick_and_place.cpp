@@ -75,6 +75,50 @@ TEST(PlanPick, ReachesTheWholeWorkspaceAndEverySlot) {
       }
 }
 
+TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
+  PickAndPlace picker(kCell, kConfig);
+  PickRequest r = request(0.5, 0.05, 0.022, 0.3, 2);
+  r.grasp.width = 0.055;
+  r.grasp.opening = 0.075;
+  r.centroid = r.grasp.T_base_tcp * Eigen::Vector3d(0.03, 0.002, 0.0);
+  PickPlan plan;
+  const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+  ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+  const Pose T_grasp = tcp(plan.approach.back().q, r.grasp.width);
+  const Pose T_slot = tcp(plan.carry.back().q, r.grasp.width);
+  const Eigen::Vector3d axis = T_slot.linear() * (T_grasp.linear().transpose() * r.grasp.T_base_tcp.linear().col(0));
+  EXPECT_NEAR(std::abs(axis.y()), 1.0, 1e-6);
+  const Eigen::Vector3d centroid = T_slot * (T_grasp.inverse() * r.centroid);
+  EXPECT_LT((centroid - kCell.tray.slots()[2]).head<2>().norm(), 1e-6);
+}
+
+TEST(PlanPick, TiltedPartsAreLetGoHigher) {
+  // A bar along base y, 80 mm high at the grasp, level or rising towards +y.
+  const PinholeIntrinsics camera = kCell.camera.color;
+  const auto release = [&](double slope) {
+    cv::Mat depth(camera.height, camera.width, CV_32FC1, cv::Scalar(0.6));
+    for (int v = 0; v < camera.height; ++v)
+      for (int u = 0; u < camera.width; ++u) {
+        const double z = 0.6 - 0.08, x = 0.5 + (u - camera.cx) / camera.fx * z, y = -(v - camera.cy) / camera.fy * z;
+        if (std::abs(x - 0.5) < 0.01 && std::abs(y) < 0.06)
+          depth.at<float>(v, u) = static_cast<float>(0.6 - (0.08 + slope * y));
+      }
+    PickAndPlace picker(kCell, kConfig);
+    picker.set_heights(grasping::HeightMap(depth, camera, kCell.camera.T_base_color, kCell));
+    PickRequest r = request(0.5, 0.0, 0.08, 0.0, 3, 0.0);
+    PickPlan plan;
+    const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+    EXPECT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+    return tcp(plan.carry.back().q, r.grasp.width).translation().z();
+  };
+  const double level = release(0.0), tilted = release(0.15);
+  EXPECT_GT(tilted, level + 0.004);
+  EXPECT_NEAR(release(-0.15), tilted, 0.003);
+  // Never lower below the tips than the table was.
+  const double table = 0.08 - kinematics::kPadHeight / 2;
+  EXPECT_LE(tilted - kinematics::kPadHeight / 2 - kCell.tray.floor_height - kConfig.release_height, table + 1e-9);
+}
+
 TEST(PlanPick, TrajectoriesAreFreeOfCollisionBetweenTheirSamples) {
   PickAndPlace picker(kCell, kConfig);
   CollisionWorld world(kCell);

@@ -107,9 +107,10 @@ class PickAndPlace {
 
  private:
   // How far, m, the part that is grasped at the pose reaches below the finger tips: by its thickness
-  // and by the slope of what the heights show along it; no lower than the table. Used to let go of
-  // a tilted part before it meets the tray, and of a flat one not too high.
-  double hang(const Pose& T_base_tcp, const Eigen::Vector3d& centroid) const;
+  // and by the slope of what the heights show along its axis; no lower than the table. Used to let
+  // go of a tilted part before it meets the tray, and of a flat one not too high.
+  double hang(const Pose& T_base_tcp, const Eigen::Vector2d& along,
+              const Eigen::Vector3d& centroid) const;
   JointVector start_of(Robot& robot) const;
   ExecutionResult move(Robot& robot, const Trajectory& trajectory);
   // The fastest trajectory along the legs that is free of collision: corners are cut less where
