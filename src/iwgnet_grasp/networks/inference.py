@@ -1,7 +1,6 @@
 """Grasp estimation on a batch of depth windows, by the fastest backend that agrees with torch."""
 
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -109,7 +108,7 @@ def torch_predictor(network: GraspNetwork, bfloat16: bool | None = None) -> Pred
 
 def openvino_predictor(network: GraspNetwork, input_px: int) -> Predictor:
     """OpenVINO, compiled for any batch of input_px windows; bfloat16 where the CPU has it."""
-    import openvino
+    from iwgnet_grasp.networks.openvino_model import compile_module
 
     class Stacked(torch.nn.Module):
         def __init__(self) -> None:
@@ -120,13 +119,7 @@ def openvino_predictor(network: GraspNetwork, input_px: int) -> Predictor:
             return torch.stack(list(self.network(x)), dim=1)
 
     example = torch.zeros(1, 1, input_px, input_px)
-    with warnings.catch_warnings():
-        # The size is fixed here, so that tracing may take the padding for a constant.
-        warnings.simplefilter("ignore", torch.jit.TracerWarning)
-        model = openvino.convert_model(
-            Stacked().cpu().eval(), example_input=example, input=[-1, 1, input_px, input_px]
-        )
-    compiled = openvino.compile_model(model, "CPU", {"PERFORMANCE_HINT": "LATENCY"})
+    compiled = compile_module(Stacked().cpu().eval(), example, [-1, 1, input_px, input_px])
 
     def predict(heights: np.ndarray) -> np.ndarray:
         return np.asarray(compiled(heights[:, None])[0], np.float32)

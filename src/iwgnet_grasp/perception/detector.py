@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -125,17 +124,10 @@ def _torch_forward(model: YOLOv5s, _: tuple[int, int]) -> Forward:
 
 
 def _openvino_forward(model: YOLOv5s, size: tuple[int, int]) -> Forward:
-    import openvino
+    from iwgnet_grasp.networks.openvino_model import compile_module
 
-    core = openvino.Core()
     example = torch.zeros(1, 3, *size, dtype=torch.uint8)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of torch's tracing, inside OpenVINO
-        network = openvino.convert_model(
-            _FromBytes(model), example_input=example, input=[1, 3, *size]
-        )
-    # Latency: one look at a time; the plugin itself takes bfloat16 where the CPU has it.
-    compiled = core.compile_model(network, "CPU", {"PERFORMANCE_HINT": "LATENCY"})
+    compiled = compile_module(_FromBytes(model), example, [1, 3, *size])
     request = compiled.create_infer_request()
 
     def forward(pixels: torch.Tensor) -> list[torch.Tensor]:

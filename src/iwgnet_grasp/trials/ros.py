@@ -107,7 +107,7 @@ class RosCell:
         }
         self._pick_place = actionlib.ActionClient(Topics.PICK_PLACE, PickPlaceAction)
 
-    def wait_until_ready(self, seconds: float = 120.0) -> None:
+    def wait_until_ready(self, seconds: float = 300.0) -> None:
         """Waits until every node is up and connected. Raises CellError naming what is missing."""
         services = [Topics.CAPTURE, Topics.OBSERVE]
         if self._simulated:
