@@ -16,6 +16,7 @@
 namespace iwgnet_grasp::nodes {
 namespace {
 
+constexpr double kLateTopic = 3.0;       // wall s
 constexpr double kGripTimeLimit = 15.0;  // s: full stroke at the slowest speed takes 4 s
 
 class GripperControl {
@@ -35,10 +36,17 @@ class GripperControl {
   }
 
   GripperWidth width_of(std::uint32_t scene_id, std::uint32_t object_id) {
-    const std::lock_guard lock(mutex_);
-    if (widths_ && widths_->scene_id == scene_id)
-      for (const GripperWidth& width : widths_->widths)
-        if (width.object_id == object_id) return width;
+    // Topic and goal come by different connections: the goal may be the first to arrive.
+    const ros::WallTime deadline = ros::WallTime::now() + ros::WallDuration(kLateTopic);
+    do {
+      {
+        const std::lock_guard lock(mutex_);
+        if (widths_ && widths_->scene_id == scene_id)
+          for (const GripperWidth& width : widths_->widths)
+            if (width.object_id == object_id) return width;
+      }
+      ros::WallDuration(0.005).sleep();
+    } while (ros::ok() && ros::WallTime::now() < deadline);
     throw Error(Topics::GRIPPER_WIDTH + " holds no width for object " + std::to_string(object_id) +
                 " of scene " + std::to_string(scene_id));
   }

@@ -27,6 +27,8 @@ namespace {
 
 using control_msgs::FollowJointTrajectoryAction;
 
+constexpr double kLateTopics = 3.0;  // wall s
+
 // The robot behind its ROS drivers.
 class RosRobot : public motion::Robot {
  public:
@@ -177,11 +179,18 @@ class MotionControl {
   motion::PickRequest request_for(const PickPlaceGoal& goal) {
     GraspPoses::ConstPtr poses;
     Scene::ConstPtr scene;
-    {
-      const std::lock_guard lock(mutex_);
-      poses = poses_;
-      scene = scene_;
-    }
+    // Topics and goals come by different connections: the goal may be the first to arrive.
+    const ros::WallTime deadline = ros::WallTime::now() + ros::WallDuration(kLateTopics);
+    do {
+      {
+        const std::lock_guard lock(mutex_);
+        poses = poses_;
+        scene = scene_;
+      }
+      if (poses && scene && poses->scene_id == goal.scene_id && scene->scene_id == goal.scene_id)
+        break;
+      ros::WallDuration(0.005).sleep();
+    } while (ros::ok() && ros::WallTime::now() < deadline);
     const std::string which = "object " + std::to_string(goal.object_id) + " of scene " +
                               std::to_string(goal.scene_id);
     const int slots = cell_.tray.columns * cell_.tray.rows;

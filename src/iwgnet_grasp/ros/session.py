@@ -22,6 +22,7 @@ from iwgnet_grasp.supervisor import CellError
 _TAG = "IWGNET_SESSION"  # environment variable by which a session knows its processes
 _PR_SET_PDEATHSIG = 1
 _DIED = re.compile(r"\[([\w/]+)-\d+\] process has died \[pid \d+, exit code (-?\d+)")
+_NODE_STARTED = re.compile(r"process\[(?!master|rosout)[\w/]+-\d+\]: started")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -81,18 +82,20 @@ class Session:
                 preexec_fn=_stop_with_parent,
             )
         try:
-            self._wait_for_master(uri)
+            self._wait_for_nodes()
         except BaseException:
             self.__exit__()
             raise
         return self
 
-    def _wait_for_master(self, uri: str, seconds: float = 30.0) -> None:
+    def _wait_for_nodes(self, seconds: float = 60.0) -> None:
+        """Until roslaunch starts nodes: the master is up then, and the parameters are set, of
+        which rospy reads /use_sim_time only once."""
         end = time.monotonic() + seconds
-        while not master_runs(uri):
+        while not _NODE_STARTED.search(self.log.read_text(errors="replace")):
             self.check()
             if time.monotonic() > end:
-                raise CellError(f"the ROS master at {uri} did not come up; see {self.log}")
+                raise CellError(f"no node was started within {seconds:.0f} s; see {self.log}")
             time.sleep(0.05)
 
     def check(self) -> None:
