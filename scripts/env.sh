@@ -5,7 +5,7 @@ IWGNET_ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 export IWGNET_ROOT
 _iwgnet_devel="$IWGNET_ROOT/.build/devel"
 _iwgnet_prepend() {  # variable, entry: prepends once
-  case ":${!1}:" in *":$2:"*) ;; *) export "$1=$2${!1:+:${!1}}" ;; esac
+  case ":${!1:-}:" in *":$2:"*) ;; *) export "$1=$2${!1:+:${!1}}" ;; esac
 }
 _iwgnet_prepend PATH "$IWGNET_ROOT/.venv/bin"
 _iwgnet_prepend CMAKE_PREFIX_PATH "$_iwgnet_devel"
