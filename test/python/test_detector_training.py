@@ -297,4 +297,5 @@ def test_malformed_training_config_is_one_line(tmp_path, text, complaint):
 
 def test_config_of_the_package_loads():
     config = DetectorTrainingConfig.load()
-    assert config.phases[-1].size == config.input
+    assert config.epochs == sum(p.epochs for p in config.phases) > 0
+    assert config.phases[-1].zoom == 1.0  # ends at the resolution that the detector sees
