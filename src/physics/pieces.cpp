@@ -247,25 +247,35 @@ class PiecesAlgorithm : public btCollisionAlgorithm {
   }
 
   // Bullet lets a fifth point always replace one of four, which makes resting bodies shiver:
-  // admit it only when it renews one of them, widens the patch or is the deepest.
+  // admit it only when it renews one of them, widens the patch or is the deepest. Points of pressing
+  // pieces and of pieces that are merely near share a patch: the former must not be crowded out.
   void admit(const Touches::Point& touch, const btCollisionObjectWrapper* a,
              const btCollisionObjectWrapper* b, btManifoldResult& result) {
     btPersistentManifold* patch = patch_for(touch.normal, a, b);
     if (patch->getNumContacts() == MANIFOLD_CACHE_SIZE) {
       btVector3 p[MANIFOLD_CACHE_SIZE];
       bool renews = false;
-      int deepest = -1;
+      int deepest = -1, shallow = 0;
+      btScalar shallowest = -1.0;
       btScalar depth = touch.distance;
       for (int k = 0; k < MANIFOLD_CACHE_SIZE; ++k) {
         const btManifoldPoint& point = patch->getContactPoint(k);
         p[k] = point.getPositionWorldOnB();
         renews = renews || (p[k] - touch.point).length() < patch->getContactBreakingThreshold();
+        if (point.getDistance() > shallowest) {
+          shallowest = point.getDistance();
+          shallow = k;
+        }
         if (point.getDistance() < depth) {
           depth = point.getDistance();
           deepest = k;
         }
       }
-      if (!renews) {
+      if (!renews && shallowest > 0.0 && touch.distance < 0.0) {
+        patch->removeContactPoint(shallow);  // what presses goes before what is only near
+      } else if (!renews && touch.distance > 0.0 && depth < 0.0) {
+        return;
+      } else if (!renews) {
         const btScalar now = extent(p[0], p[1], p[2], p[3]);
         btScalar best = 0.0;
         for (int k = 0; k < MANIFOLD_CACHE_SIZE; ++k) {
