@@ -9,6 +9,10 @@ from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
 # px. GG-CNN's 2 would blunt the narrow peaks (a third of a 20 px opening) more than the wide ones.
 Q_SIGMA = 1.0
 MAP_SIGMA = 1.0  # px, of cos, sin and width
+# px (about mm at 0.6 m), across the closing direction. The best place on a shank is often right
+# beside a shoulder, where three millimetres decide between a face and an edge under the pads: a
+# grasp counts as what it is worth on average over so much error of its place.
+PLACE_SIGMA = 3.0
 
 
 def decode_grasps(
@@ -20,7 +24,7 @@ def decode_grasps(
     min_distance_px: int = 6,
     threshold: float = 0.02,
 ) -> list[Grasp]:
-    """Local maxima of the smoothed quality, best first. All maps float32 [H, W].
+    """Local maxima of the expected quality, best first. All maps float32 [H, W].
 
     cos 2theta and sin 2theta are smoothed, never the angle, which jumps at +-90 deg. Grasps closer
     than `min_distance_px` to a better one and below `threshold` are left out.
@@ -29,6 +33,7 @@ def decode_grasps(
     cos = cv2.GaussianBlur(cos, (0, 0), MAP_SIGMA)
     sin = cv2.GaussianBlur(sin, (0, 0), MAP_SIGMA)
     width = cv2.GaussianBlur(width, (0, 0), MAP_SIGMA)
+    q = expected_quality(q, cos, sin, PLACE_SIGMA)
     grasps = []
     for y, x in local_maxima(q, min_distance_px, threshold, max_grasps):
         theta = float(wrap_theta(0.5 * np.arctan2(sin[y, x], cos[y, x])))
@@ -36,6 +41,21 @@ def decode_grasps(
         quality = float(np.clip(q[y, x], 0, 1))
         grasps.append(Grasp(float(x), float(y), theta, opening, quality))
     return grasps
+
+
+def expected_quality(q: np.ndarray, cos: np.ndarray, sin: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian mean of the quality along the jaws, across each pixel's closing direction."""
+    theta = 0.5 * np.arctan2(sin, cos)
+    dx, dy = np.sin(theta), np.cos(theta)  # the closing direction is (cos, -sin) in the image
+    rows, columns = np.mgrid[0 : q.shape[0], 0 : q.shape[1]].astype(np.float32)
+    reach = int(np.ceil(2 * sigma))
+    steps = np.arange(-reach, reach + 1)
+    weights = np.exp(-0.5 * (steps / sigma) ** 2)
+    mean = np.zeros_like(q)
+    for step, weight in zip(steps, weights / weights.sum(), strict=True):
+        x, y = columns + np.float32(step) * dx, rows + np.float32(step) * dy
+        mean += np.float32(weight) * cv2.remap(q, x, y, cv2.INTER_LINEAR)
+    return mean
 
 
 def local_maxima(
