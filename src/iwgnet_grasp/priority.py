@@ -27,6 +27,7 @@ class PriorityConfig:
 
     alpha: float = 1.0  # weight of D
     beta: float = 1.0  # weight of G
+    min_quality: float = 0.0  # a best grasp below it is tried after all others
     failed_radius_px: float = 15.0
     failed_angle_rad: float = math.radians(25.0)
 
@@ -39,6 +40,7 @@ class PriorityConfig:
             config = PriorityConfig(
                 alpha=float(text["alpha"]),
                 beta=float(text["beta"]),
+                min_quality=float(text["min_quality"]),
                 failed_radius_px=float(text["failed_radius_px"]),
                 failed_angle_rad=math.radians(float(text["failed_angle_deg"])),
             )
@@ -49,9 +51,15 @@ class PriorityConfig:
         except (yaml.YAMLError, TypeError, ValueError) as error:
             line = " ".join(str(error).split())
             raise PerceptionError(f"{path}: not a valid priority config ({line})") from error
-        values = (config.alpha, config.beta, config.failed_radius_px, config.failed_angle_rad)
+        values = (
+            config.alpha,
+            config.beta,
+            config.min_quality,
+            config.failed_radius_px,
+            config.failed_angle_rad,
+        )
         if not all(math.isfinite(v) and v >= 0 for v in values):
-            raise PerceptionError(f"{path}: weights, radius and angle must be finite and >= 0")
+            raise PerceptionError(f"{path}: all values must be finite and >= 0")
         return config
 
 
@@ -63,8 +71,8 @@ class RankedObject:
     depth_distance_m: float  # D of Eq. 17; NaN when not scored, as are the next two
     centroid_distance_m: float  # G of Eq. 20
     score: float  # S of Eq. 17
-    priority: float  # S* of Eq. 21; 0 when not scored
-    reason: str = ""  # why it was not scored and goes last
+    priority: float  # S* of Eq. 21; 0 for the objects that go last
+    reason: str = ""  # why it goes last
 
 
 @dataclass(frozen=True)
@@ -87,9 +95,12 @@ def rank(
     without_failed); the returned objects hold the grasps that are left. The degenerate cases:
     one object, or equal scores -> S* = 1 for all (Eq. 21 is 0/0 there); an object without a
     valid pixel or without depth at its grasp has no S: it goes last with S* = 0 and its reason;
-    an object without any grasp left is dropped.
+    an object without any grasp left is dropped. Beyond the paper, whose score does not see the
+    quality of a grasp: an object whose best grasp is below config.min_quality comes after all
+    that are above, by ascending S, with S* = 0 and the reason, and does not count in Eq. 21.
     """
     scored: list[RankedObject] = []
+    doubtful: list[RankedObject] = []
     last: list[RankedObject] = []
     dropped: list[tuple[ObjectGrasps, str]] = []
     for candidate in objects:
@@ -105,11 +116,17 @@ def rank(
         depth_distance = left.grasps[0].depth_m
         distance = centroid_distance(left, left.grasps[0], camera)
         score = config.alpha * depth_distance + config.beta * distance  # Eq. 17
-        scored.append(RankedObject(left, depth_distance, distance, score, math.nan))
+        quality = left.grasps[0].quality
+        if quality < config.min_quality:
+            reason = f"grasp quality {quality:.2f} is below {config.min_quality:.2f}"
+            doubtful.append(RankedObject(left, depth_distance, distance, score, 0.0, reason))
+        else:
+            scored.append(RankedObject(left, depth_distance, distance, score, math.nan))
     priorities = normalised([entry.score for entry in scored])
     scored = [replace(entry, priority=p) for entry, p in zip(scored, priorities, strict=True)]
     scored.sort(key=lambda entry: -entry.priority)  # stable
-    return Ranking(tuple(scored + last), tuple(dropped))
+    doubtful.sort(key=lambda entry: entry.score)
+    return Ranking(tuple(scored + doubtful + last), tuple(dropped))
 
 
 def centroid_distance(
