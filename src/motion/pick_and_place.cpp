@@ -252,14 +252,17 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
       grasp.T_base_tcp.linear().col(lengthwise ? 0 : 1).head<2>().normalized();
   const double hang = this->hang(grasp.T_base_tcp, along, request.centroid);
   const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
-  const auto slot_poses = [&](int grasp_turn) {
+  const Eigen::Vector3d slot = slots[request.tray_slot];
+  const double inwards = cell_.tray.center.x() < slot.x() ? -1.0 : 1.0;
+  const auto slot_poses = [&](int grasp_turn, double shift) {
     Pose T = Pose::Identity();
     T.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
     if (lengthwise) T.rotate(Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitZ()));
     std::array<Pose, 2> poses{T, half_turn(T)};
     for (Pose& pose : poses) {
       const Eigen::Vector3d centroid = grasp_turn == 0 ? offset : Eigen::Vector3d(-offset);
-      pose.translation() = slots[request.tray_slot] - pose.linear() * centroid;
+      pose.translation() = slot - pose.linear() * centroid;
+      pose.translation().x() += inwards * shift;
       pose.translation().z() =
           cell_.tray.floor_height + config_.release_height + hang + kinematics::kPadHeight / 2;
     }
@@ -274,15 +277,19 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   };
   std::vector<Combination> combinations;
   world_.set_gripper_gap(released);
-  for (const Reached& g : grasps) {
-    const auto poses = slot_poses(g.turn);
-    world_.set_columns({poses[0].translation().head<2>(), poses[1].translation().head<2>()});
-    for (const Reached& s : reach(world_, poses, grasp.width, rise, g.high, config_.carry, why)) {
-      const double cost = duration(start, g.high, config_.limits) +
-                          duration(g.high, s.high, config_.carry) +
-                          duration(s.high, cell_.observe_joints, config_.limits);
-      combinations.push_back({&g, s, poses[s.turn].translation().head<2>(), cost});
+  // Fingers far apart may not fit beside the wall: then somewhat inwards.
+  for (const double shift : {0.0, 0.01, 0.02}) {
+    for (const Reached& g : grasps) {
+      const auto poses = slot_poses(g.turn, shift);
+      world_.set_columns({poses[0].translation().head<2>(), poses[1].translation().head<2>()});
+      for (const Reached& s : reach(world_, poses, grasp.width, rise, g.high, config_.carry, why)) {
+        const double cost = duration(start, g.high, config_.limits) +
+                            duration(g.high, s.high, config_.carry) +
+                            duration(s.high, cell_.observe_joints, config_.limits);
+        combinations.push_back({&g, s, poses[s.turn].translation().head<2>(), cost});
+      }
     }
+    if (!combinations.empty()) break;
   }
   if (combinations.empty())
     return finish(PickReason::kUnreachable,

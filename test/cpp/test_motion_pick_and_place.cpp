@@ -75,6 +75,19 @@ TEST(PlanPick, ReachesTheWholeWorkspaceAndEverySlot) {
       }
 }
 
+TEST(PlanPick, WideGraspsFitBesideTheTraysWalls) {
+  PickAndPlace picker(kCell, kConfig);
+  for (const int slot : {0, 4, 5, 9})
+    for (const double width : {0.04, 0.055, 0.065}) {
+      PickRequest r = request(0.5, 0.05, 0.022, 0.3, slot);
+      r.grasp.width = width;
+      r.grasp.opening = 0.08;
+      PickPlan plan;
+      const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+      EXPECT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+    }
+}
+
 TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
   PickAndPlace picker(kCell, kConfig);
   PickRequest r = request(0.5, 0.05, 0.022, 0.3, 2);
