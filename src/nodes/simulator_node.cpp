@@ -40,6 +40,8 @@ using control_msgs::GripperCommandAction;
 using physics::TrajectoryStatus;
 namespace encodings = sensor_msgs::image_encodings;
 
+constexpr double kSubscribingTime = 0.03;  // wall s
+
 struct Settings {
   double speed;           // x real time while the robot works; 0: as fast as the machine allows
   double idle_speed;      // x real time while it waits for the other nodes
@@ -447,11 +449,16 @@ class Simulator {
         &color_, &color_info_, &depth_, &depth_info_, &aligned_, &aligned_info_, &points_};
     unsigned listeners = 0;
     for (const ros::Publisher* publisher : publishers) listeners += publisher->getNumSubscribers();
-    const bool newcomer = listeners > listeners_;  // does not have to wait for the next frame
+    const ros::WallTime wall = ros::WallTime::now();
+    // A newcomer need not wait for the next frame, but for the other topics that it is about to
+    // subscribe to: one frame then serves them all.
+    if (listeners > listeners_) newcomer_wall_ = wall;
     listeners_ = listeners;
     if (listeners == 0) return;
-    const ros::WallTime wall = ros::WallTime::now();
-    if (!newcomer) {
+    if (!newcomer_wall_.isZero()) {
+      if ((wall - newcomer_wall_).toSec() < kSubscribingTime) return;
+      newcomer_wall_ = ros::WallTime();
+    } else {
       if ((wall - frame_wall_).toSec() < 1.0 / settings_.camera_wall_rate) return;
       if (!paused_ && !frame_due_.due(cell_.time())) return;
     }
@@ -626,7 +633,7 @@ class Simulator {
   bool paused_ = false;
   bool commanded_ = false;  // a trajectory from topic 5, without an action, is under way
   unsigned listeners_ = 0;
-  ros::WallTime clock_wall_, frame_wall_;
+  ros::WallTime clock_wall_, frame_wall_, newcomer_wall_;
   Periodic joint_states_due_, gripper_state_due_, controller_state_due_, frame_due_;
 
   ros::NodeHandle node_;
