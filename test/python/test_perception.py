@@ -22,6 +22,7 @@ from iwgnet_grasp.perception import (
 )
 from iwgnet_grasp.perception.detector import Detector, resolve_backend
 from iwgnet_grasp.perception.merged_depth import (
+    MARGIN_PX,
     centroid,
     crop_window,
     grasp_depth,
@@ -92,12 +93,21 @@ def test_merge_takes_the_box_from_the_scene_and_the_rest_from_the_empty_scene():
     assert np.all(merged[outside] == np.float32(TABLE))
 
 
+def with_margin(box: Box) -> Box:
+    """The box and MARGIN_PX around it, inside a 640x480 image."""
+    left, top = max(box.x - MARGIN_PX, 0), max(box.y - MARGIN_PX, 0)
+    right = min(box.x + box.width + MARGIN_PX, 640)
+    bottom = min(box.y + box.height + MARGIN_PX, 480)
+    return Box(left, top, right - left, bottom - top)
+
+
 def test_window_is_centred_on_the_box_at_native_resolution():
     depth = scene()
     window = crop_window(depth, table(), BOX, 224)
     rows, columns = (slice(window.y, window.y + 224), slice(window.x, window.x + 224))
     assert window.depth.shape == window.empty.shape == (224, 224)
-    np.testing.assert_array_equal(window.depth, merge(depth, table(), BOX)[rows, columns])
+    expected = merge(depth, table(), with_margin(BOX))
+    np.testing.assert_array_equal(window.depth, expected[rows, columns])
     u, v = BOX.center
     assert abs(window.x + 111.5 - u) <= 0.5
     assert abs(window.y + 111.5 - v) <= 0.5
@@ -115,8 +125,10 @@ def test_window_never_leaves_the_image(x, y, width, height):
     window = crop_window(depth, table(), box, 224)
     assert 0 <= window.x <= 640 - 224
     assert 0 <= window.y <= 480 - 224
-    expected = merge(depth, table(), box)[window.y : window.y + 224, window.x : window.x + 224]
-    np.testing.assert_array_equal(window.depth, expected)
+    expected = merge(depth, table(), with_margin(box))
+    np.testing.assert_array_equal(
+        window.depth, expected[window.y : window.y + 224, window.x : window.x + 224]
+    )
 
 
 def test_window_larger_than_the_image_is_refused():
