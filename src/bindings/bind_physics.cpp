@@ -203,6 +203,17 @@ void bind_physics(py::module_& m) {
           "px that each part would cover with nothing before it")
       .def("lay_in_tray", &SimulatedCell::lay_in_tray, "part"_a, "slot"_a,
            "Moves a part into a slot of the tray at once: for the looks of a half-cleared table.")
+      .def(
+          "lay_parts",
+          [](SimulatedCell& c, const std::vector<Eigen::Matrix4d>& poses) {
+            std::vector<Pose> T_base_part;
+            for (const auto& T : poses) T_base_part.push_back(to_pose(T, "T_base_part"));
+            py::gil_scoped_release release;
+            c.lay_parts(T_base_part);
+          },
+          "T_base_part"_a,
+          "Parts at rest in these poses, as part_poses() gave them, arm observing, time 0, judge "
+          "reset; camera, light and materials stay.")
       .def("show_parts", &SimulatedCell::show_parts, "shown"_a,
            "Whether the camera sees the parts; the physics keeps them.")
       .def("set_light", &SimulatedCell::set_light, "light"_a)

@@ -480,6 +480,18 @@ void SimulatedCell::lay_in_tray(int part, int slot) {
   m.world.set_part_pose(part, T);
 }
 
+void SimulatedCell::lay_parts(const std::vector<Pose>& T_base_part) {
+  Impl& m = *impl_;
+  if (T_base_part.size() != m.models.size())
+    throw Error(std::to_string(T_base_part.size()) + " poses for the scene's " +
+                std::to_string(m.models.size()) + " parts");
+  m.world.reset(m.config.observe_joints);
+  for (std::size_t i = 0; i < m.models.size(); ++i) m.world.add_part(m.models[i], T_base_part[i]);
+  m.arm_controller.reset(m.config.observe_joints);
+  m.gripper_controller.reset();
+  m.judge.reset(m.world);
+}
+
 void SimulatedCell::show_parts(bool shown) {
   for (const int instance : impl_->part_instances) impl_->renderer.set_visible(instance, shown);
 }

@@ -65,6 +65,10 @@ class SimulatedCell {
   std::vector<double> unoccluded_areas();
   // Moves a part into a slot of the tray at once: for data of half-cleared tables, not for trials.
   void lay_in_tray(int part, int slot);
+  // The scene's parts at rest in these poses, the arm at the observing pose, time 0, judge reset:
+  // the same settled scene for one try after another. Camera, light and materials stay as they
+  // are. Throws Error for another number of poses than of parts.
+  void lay_parts(const std::vector<Pose>& T_base_part);
   void show_parts(bool shown);            // to the camera; the physics keeps them
   void set_light(const sensing::Light& light);
   void set_part_material(int part, const sensing::Material& material);
