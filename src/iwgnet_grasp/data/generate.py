@@ -75,8 +75,9 @@ class SceneMaker:
         """The LOOKS scenes of a pile. Raises DataError when no attempt can be built."""
         for attempt in range(PILE_ATTEMPTS):
             rng = pile_rng(seed, pile, attempt)
+            spec = self.spec(rng)
             try:
-                self.cell.build_scene(self.spec(rng), int(rng.integers(2**62)))
+                self.cell.build_scene(spec, int(rng.integers(2**62)))
                 break
             except self.core.CoreError as error:
                 reason = str(error)
@@ -95,7 +96,9 @@ class SceneMaker:
                 settle = self.settings["scene"]["resettle_time"]
                 self.cell.step(round(settle / self.cell.timestep))
             self.dress(rng)
-            yield self.observe(rng)
+            scene = self.observe(rng)
+            scene.arrangement = spec.arrangement.name.lower()
+            yield scene
 
     def spec(self, rng: np.random.Generator) -> Any:
         s = self.settings["scene"]
@@ -240,6 +243,7 @@ class Scene:
     stereo: np.ndarray
     empty_stereo: np.ndarray
     objects: list[SceneObject]
+    arrangement: str = ""  # scattered or stacked
 
 
 def rectangle_row(label: Any) -> list[float]:
@@ -307,7 +311,14 @@ def write_scene(scene: Scene, number: int, out: Path, categories: list[str]) -> 
     annotations = [annotation(o, categories) for o in scene.objects]
     height, width = scene.color.shape[:2]
     (folder / "detector.json").write_text(
-        json.dumps({"width": width, "height": height, "annotations": annotations})
+        json.dumps(
+            {
+                "width": width,
+                "height": height,
+                "arrangement": scene.arrangement,
+                "annotations": annotations,
+            }
+        )
     )
     folder.rename(out / f"{number:06d}")
 
@@ -319,6 +330,7 @@ def annotation(o: SceneObject, categories: list[str]) -> dict:
     code = coco_mask.encode(np.asfortranarray(o.mask.astype(np.uint8)))
     return {
         "category_id": categories.index(o.family) + 1,
+        "part": o.part,  # the <object> of its crop's name
         "bbox": [int(v) for v in o.box],
         "area": int(np.count_nonzero(o.mask)),
         "segmentation": {"size": list(code["size"]), "counts": code["counts"].decode("ascii")},
