@@ -364,6 +364,7 @@ def write_annotations(out: Path, categories: list[str]) -> tuple[int, int]:
                 "file_name": f"{number:06d}.png",
                 "width": scene["width"],
                 "height": scene["height"],
+                "arrangement": scene.get("arrangement", ""),
             }
         )
         for entry in scene["annotations"]:
