@@ -38,6 +38,7 @@ def run(options: argparse.Namespace, settings: Settings) -> Trial:
         f"calibration:={options.calibration.resolve() if options.calibration else ''}",
         f"bag:={(options.out / 'trial.bag').resolve() if options.record else ''}",
         f"bag_topics:={RECORDED}",
+        f"config_dir:={options.config_dir.resolve()}",
     ]
     trial = Trial(scene, options.seed, settings.replan, "ros")
     try:
@@ -61,12 +62,12 @@ def _on_graph(
 
     from iwgnet_grasp.trials.ros import RosCell
 
-    pictures = Pictures(options.out)
+    pictures = Pictures(options.out) if options.pictures else None
     os.environ["ROS_LOG_DIR"] = str(session.log.parent)
     # The supervisor is this process; its signals are main()'s.
     rospy.init_node("supervisor", disable_signals=True)
     try:
-        cell = RosCell(simulated, session.check, on_plan=pictures.draw)
+        cell = RosCell(simulated, session.check, on_plan=pictures and pictures.draw)
         cell.wait_until_ready()
         if simulated:
             cell.load(scene, options.seed)
@@ -85,7 +86,8 @@ def _on_graph(
         )
     finally:
         rospy.signal_shutdown("the trial is over")
-        pictures.finish()
+        if pictures:
+            pictures.finish()
 
 
 def _ask(prompt: str) -> None:
@@ -107,6 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--record", required=True)
     parser.add_argument("--driver", required=True)
     parser.add_argument("--calibration", type=Path)
+    parser.add_argument("--config-dir", type=Path, default=PACKAGE / "config")
+    parser.add_argument("--no-pictures", dest="pictures", action="store_false")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
     options.record = options.record == "true"
@@ -116,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     signal.signal(signal.SIGTERM, interrupt)
     try:
-        settings = load_settings(PACKAGE / "config", replan=options.replan)
+        settings = load_settings(options.config_dir, replan=options.replan)
         options.out.mkdir(parents=True, exist_ok=True)
         # Nothing of an older trial may pass for this one's.
         (options.out / "trial.json").unlink(missing_ok=True)

@@ -50,7 +50,10 @@ class InProcessCell:
         perception: Perceives,
         package_dir: Path = PACKAGE,
         config_dir: Path | None = None,
+        T_base_color: np.ndarray | None = None,
     ) -> None:
+        """T_base_color: (4, 4), where the planner believes the colour camera to be (a calibration);
+        None: config_dir/camera.yaml's nominal pose."""
         core = _core()
         config_dir = config_dir or package_dir / "config"
         self._core = core
@@ -61,6 +64,7 @@ class InProcessCell:
         self._grasp_config = core.load_grasp_pose_config(str(config_dir))
         self._pick_config = core.load_pick_place_config(str(config_dir))
         self._robot = core.SimulatedRobot(self.simulated)
+        self._T_base_color = T_base_color
         self._empty_depth: np.ndarray | None = None
         self._scene_id = 0
         self._frames: tuple[np.ndarray, np.ndarray] | None = None
@@ -99,6 +103,8 @@ class InProcessCell:
         except PerceptionError as error:
             raise CellError(str(error)) from None
         camera = self.simulated.camera
+        if self._T_base_color is not None:
+            camera.T_base_color = self._T_base_color
         k = camera.color
         intrinsics = CameraIntrinsics(k.fx, k.fy, k.cx, k.cy)
         ranking = rank(look.objects, intrinsics, self._priority, failed)
@@ -179,6 +185,15 @@ class InProcessCell:
         return judged_by(self.simulated.verdict)
 
 
+def load_calibration(path: str | Path) -> np.ndarray:
+    """(4, 4) T_base_color of a calibration's result. Raises CellError."""
+    core = _core()
+    try:
+        return core.load_camera_pose(str(path))
+    except core.CoreError as error:
+        raise CellError(str(error)) from None
+
+
 def _core():
     try:
         from iwgnet_grasp import _core
@@ -200,18 +215,19 @@ def run(
     say: Callable[[str], None] = print,
     cell: InProcessCell | None = None,
     on_plan: Callable[[Plan], None] | None = None,
+    config_dir: Path = PACKAGE / "config",
 ) -> Trial:
-    """One trial; the perception of config/perception.yaml unless another is given. A `cell` is
-    used again, which saves its set-up. on_plan is told all that was made of each look. Raises
+    """One trial; the perception of config_dir/perception.yaml unless another is given. A `cell`
+    is used again, which saves its set-up. on_plan is told all that was made of each look. Raises
     CellError, PerceptionError or ValueError for arguments and files that cannot be used.
     """
-    settings = load_settings(PACKAGE / "config", replan=replan)
+    settings = load_settings(config_dir, replan=replan)
     if cell is None:
         if perception is None:
             from iwgnet_grasp.perception import load_perception
 
-            perception = load_perception()
-        cell = InProcessCell(perception)
+            perception = load_perception(config_dir / "perception.yaml")
+        cell = InProcessCell(perception, config_dir=config_dir)
     cell.on_plan = on_plan
     cell.load(scene, seed)
     return run_trial(

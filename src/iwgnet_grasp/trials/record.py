@@ -77,6 +77,8 @@ def pick_entry(attempt: Attempt, verdict: Verdict | None) -> dict:
         "slip_mm": None,
         "slip_deg": None,
         "part": None,
+        "position": None,
+        "tray_slot": attempt.tray_slot,
         "look": target.scene_id,
         "label": target.label,
         "message": outcome.message,
@@ -104,6 +106,7 @@ def pick_entry(attempt: Attempt, verdict: Verdict | None) -> dict:
         entry["slip_mm"] = round(max(pick["slip_mm"] for pick in judged), 3)
         entry["slip_deg"] = round(max(pick["slip_deg"] for pick in judged), 3)
         entry["part"] = worst["part"] if worst["part"] >= 0 else None
+        entry["position"] = worst.get("position")
     return entry
 
 

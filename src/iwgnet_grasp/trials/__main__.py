@@ -1,0 +1,157 @@
+"""`scripts/run_trials`: tables of trials, comparisons, replays and reports."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from iwgnet_grasp.supervisor import CellError
+from iwgnet_grasp.trials.batch import BatchError, Run, run_trials, scene_names
+from iwgnet_grasp.trials.overrides import OverrideError, parse_overrides
+from iwgnet_grasp.trials.pool import PoolError
+from iwgnet_grasp.trials.progress import Progress
+from iwgnet_grasp.trials.table import print_table
+from iwgnet_grasp.trials.worker import PACKAGE, Conditions
+
+app = typer.Typer(
+    name="run_trials",
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+_UsageError = typer.BadParameter.__base__  # typer does not give it a name of its own
+Replan = StrEnum("Replan", ["once", "every"])
+Transport = StrEnum("Transport", ["inprocess", "ros"])
+
+SceneOption = Annotated[
+    str, typer.Option("--scene", help="Of config/scenes.yaml, several with commas, or all.")
+]
+TrialsOption = Annotated[int, typer.Option("--trials", help="Trials of each scene.")]
+SeedOption = Annotated[int, typer.Option("--seed", help="Of the first trial; they count up.")]
+ReplanOption = Annotated[
+    Replan, typer.Option(help="every: look again after each pick; once: one look (paper).")
+]
+TransportOption = Annotated[Transport, typer.Option(help="In one process or over the ROS graph.")]
+WorkersOption = Annotated[int, typer.Option(min=1, help="Trials at a time; Ray from 2 on.")]
+AddressOption = Annotated[
+    str | None, typer.Option(help="Ray cluster: HOST:PORT, ray://HOST:PORT or auto.")
+]
+SetOption = Annotated[
+    list[str], typer.Option("--set", help="FILE.KEY=VALUE of config/; give it again for more.")
+]
+CalibrationOption = Annotated[
+    Path | None, typer.Option(help="File with the camera pose to plan with; else the nominal one.")
+]
+
+
+@app.callback(invoke_without_command=True)
+def run(
+    context: typer.Context,
+    scene: SceneOption = "all",
+    trials: TrialsOption = 50,
+    seed: SeedOption = 0,
+    replan: ReplanOption = Replan.every,
+    transport: TransportOption = Transport.inprocess,
+    workers: WorkersOption = 1,
+    address: AddressOption = None,
+    changes: SetOption = [],  # noqa: B006
+    calibration: CalibrationOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; one that holds this run is gone on with.")
+    ] = None,
+) -> None:
+    """Clears simulated tables, trial after trial, and says how often that succeeds.
+
+    Example: scripts/run_trials --scene ten_stacked --trials 50 --workers 2
+
+    Exit status: 0 all trials have run, 1 they broke off, 2 bad arguments.
+    """
+    if context.invoked_subcommand:
+        return
+    scenes = chosen_scenes(scene)
+    conditions = Conditions(
+        replan.value, transport.value, parse_overrides(changes), _existing(calibration)
+    )
+    out = out or PACKAGE / "results" / "runs" / f"{time.strftime('%Y%m%d-%H%M%S')}_{scene}"
+    with Progress() as progress:
+        summary = checked_run(
+            Run(scenes, trials, seed, conditions), out, workers, address, progress
+        )
+    print_table(summary)
+    typer.echo(f"trials and summary in {out}")
+
+
+def checked_run(
+    run: Run, out: Path, workers: int, address: str | None, progress: Progress, name: str = ""
+) -> dict:
+    """run_trials() with a progress bar, and with its arguments checked first."""
+    if run.trials < 1:
+        raise BatchError("--trials must be at least 1")
+    if run.first_seed < 0:
+        raise BatchError("--seed must not be negative")
+    progress.begin(run, name)
+    try:
+        return run_trials(run, out, workers, address, progress.found, progress.add)
+    except (KeyboardInterrupt, CellError, PoolError):
+        if progress.finished:
+            progress.say(
+                f"{progress.finished} finished trials are in {out}; the same command with "
+                f"--out {out} goes on from there"
+            )
+        raise
+
+
+def chosen_scenes(text: str) -> tuple[str, ...]:
+    """The scenes of --scene. Raises BatchError."""
+    known = scene_names()
+    names = known if text == "all" else text.split(",")
+    for name in names:
+        if name not in known:
+            raise BatchError(f"--scene: '{name}' is not one of all, {', '.join(known)}")
+    return tuple(dict.fromkeys(names))
+
+
+def _existing(path: Path | None) -> str:
+    if path is None:
+        return ""
+    if not path.is_file():
+        raise BatchError(f"--calibration {path}: no such file")
+    return str(path.resolve())
+
+
+def main() -> None:
+    """Entry point: what a user can mend ends in one line."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        app(prog_name="run_trials", standalone_mode=False)
+    except (typer.Abort, KeyboardInterrupt):
+        _end("interrupted", 1)
+    except _UsageError as error:
+        _end(" ".join(error.format_message().split()), 2)
+    except (CellError, PoolError) as error:
+        _end(str(error), 1)
+    except (BatchError, OverrideError, ValueError) as error:
+        _end(str(error), 2)
+    except OSError as error:
+        _end(f"{error.filename or 'file'}: {error.strerror or error}", 2)
+
+
+def _end(line: str, status: int) -> None:
+    print(f"run_trials: {line}", file=sys.stderr)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

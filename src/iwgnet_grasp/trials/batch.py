@@ -1,0 +1,199 @@
+"""A run of trials in a folder: what its conditions are, which trials are done, what they say.
+
+The folder holds settings.json, trials.jsonl (a line a trial, flushed as the trial ends) and
+summary.json. The same settings go on where a killed run stopped; others are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import yaml
+
+from iwgnet_grasp.trials.overrides import changed_config
+from iwgnet_grasp.trials.pool import Task, run_here, run_with_ray
+from iwgnet_grasp.trials.record import write_json
+from iwgnet_grasp.trials.statistics import Record, summary
+from iwgnet_grasp.trials.worker import PACKAGE, Conditions
+
+_NOT_OF_TRIALS = ("dataset.yaml", "detector_training.yaml")
+
+
+class BatchError(ValueError):
+    """A run that cannot be started; one line."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Trials of each scene with the seeds first_seed ... first_seed + trials - 1."""
+
+    scenes: tuple[str, ...]
+    trials: int
+    first_seed: int
+    conditions: Conditions = Conditions()
+
+    def tasks(self) -> list[Task]:
+        """Seed by seed, so that a run that is cut off has as many trials of each scene."""
+        seeds = range(self.first_seed, self.first_seed + self.trials)
+        return [(scene, seed) for seed in seeds for scene in self.scenes]
+
+
+def scene_names(config_dir: Path = PACKAGE / "config") -> list[str]:
+    return list(yaml.safe_load((config_dir / "scenes.yaml").read_text()))
+
+
+def run_trials(
+    run: Run,
+    out: Path,
+    workers: int = 1,
+    address: str | None = None,
+    on_start: Callable[[list[Record]], None] = lambda records: None,
+    on_record: Callable[[Record], None] = lambda record: None,
+) -> dict:
+    """Runs what is still to be run; returns the summary, which is also in out/summary.json.
+
+    on_start is told the trials that the folder holds already, on_record each new one. Raises
+    BatchError for a folder of another run, PoolError or CellError when trials cannot go on; what
+    was finished stays in the folder, also after KeyboardInterrupt.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    _claim(out, run)
+    records = read_records(out)
+    on_start(records)
+    done = {(record["scene"], record["seed"]) for record in records}
+    tasks = [task for task in run.tasks() if task not in done]
+    commit = _commit()
+    try:
+        if tasks:
+            with (out / "trials.jsonl").open("a") as file:
+                for record in _records(run.conditions, tasks, out / "logs", workers, address):
+                    record["commit"] = commit
+                    file.write(json.dumps(record, allow_nan=False) + "\n")
+                    file.flush()
+                    os.fsync(file.fileno())
+                    records.append(record)
+                    on_record(record)
+    finally:
+        result = {"run": _as_json(run), **summary(records, run.scenes)}
+        write_json(out / "summary.json", result)
+    return result
+
+
+def _records(
+    conditions: Conditions, tasks: Sequence[Task], logs: Path, workers: int, address: str | None
+) -> Iterator[Record]:
+    if workers == 1 and address is None:
+        return run_here(conditions, tasks, logs)
+    return run_with_ray(conditions, tasks, logs, workers, address)
+
+
+def read_records(out: Path) -> list[Record]:
+    """The trials of a folder; a last line that was cut off in the middle is taken away."""
+    path = out / "trials.jsonl"
+    if not path.is_file():
+        return []
+    text = path.read_text()
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        path.write_text(whole)
+    try:
+        return [json.loads(line) for line in whole.splitlines()]
+    except json.JSONDecodeError as error:
+        raise BatchError(f"{path}: is not a file of trials ({error})") from None
+
+
+def read_summary(out: Path) -> dict:
+    """summary.json of a folder. Raises BatchError."""
+    path = out / "summary.json"
+    try:
+        return json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise BatchError(f"{path}: is not the summary of a run ({error})") from None
+
+
+def _claim(out: Path, run: Run) -> None:
+    """Writes settings.json, or compares it: only the number of trials may grow."""
+    path = out / "settings.json"
+    settings = {**_as_json(run), "inputs": _inputs(run.conditions)}
+    if path.exists():
+        try:
+            stored = json.loads(path.read_text())
+        except (OSError, json.JSONDecodeError):
+            raise BatchError(f"--out {out}: its settings.json cannot be read") from None
+        different = [
+            key
+            for key in sorted(settings.keys() | stored.keys())
+            if key != "trials" and settings.get(key) != stored.get(key)
+        ]
+        if different:
+            key = different[0]
+            old, new = stored.get(key), settings.get(key)
+            what = f"{key} is {_short(old)} there, {_short(new)} here"
+            if key == "inputs":
+                changed = [n for n in old.keys() | new.keys() if old.get(n) != new.get(n)]
+                what = f"{', '.join(sorted(changed))} changed since"
+            raise BatchError(f"--out {out}: holds another run ({what}); choose another folder")
+        if stored["trials"] > run.trials:
+            raise BatchError(
+                f"--out {out}: holds a run of {stored['trials']} trials; give as many or more"
+            )
+    elif any(out.iterdir()):
+        raise BatchError(f"--out {out}: is not empty and holds no run of trials")
+    write_json(path, settings)
+
+
+def _as_json(run: Run) -> dict:
+    settings = {**asdict(run), **asdict(run.conditions)}
+    del settings["conditions"]
+    settings["scenes"] = list(run.scenes)
+    return settings
+
+
+def _inputs(conditions: Conditions) -> dict[str, str]:
+    """Digests of the settings and weights that the trials depend on, by file."""
+    with changed_config(PACKAGE / "config", conditions.overrides) as config_dir:
+        paths = {f"config/{p.name}": p for p in sorted(config_dir.glob("*.yaml"))}
+        perception = yaml.safe_load((config_dir / "perception.yaml").read_text())
+    contents = {}
+    for name, path in paths.items():
+        if path.name in _NOT_OF_TRIALS:
+            continue
+        contents[name] = (PACKAGE / "config" / path.name).read_bytes()
+    for part in ("detector", "grasps"):
+        weights = perception[part]["weights"]
+        try:
+            contents[weights] = (PACKAGE / weights).read_bytes()
+        except OSError as error:
+            raise BatchError(f"{weights}: cannot be read ({error.strerror})") from None
+    if conditions.calibration:
+        contents[conditions.calibration] = Path(conditions.calibration).read_bytes()
+    return {name: hashlib.sha256(data).hexdigest()[:16] for name, data in contents.items()}
+
+
+def _commit() -> str:
+    """The checkout's commit, with '+' when tracked files differ from it; '' outside of git."""
+    try:
+        git = ["git", "-C", str(PACKAGE)]
+        commit = subprocess.run(
+            [*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "-uno", "--", "src", "include", "config", "urdf"],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit + ("+" if changed else "")
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else text[:57] + "..."
