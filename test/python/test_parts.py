@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from iwgnet_grasp import assets
 from iwgnet_grasp.parts import PartError, add_part, configured_parts, load_part, save_part
 from iwgnet_grasp.parts.families import sum_of
-from iwgnet_grasp.parts.library import library_axes, make_library
+from iwgnet_grasp.parts.library import library_axes, make_library, part_from_mesh
 from iwgnet_grasp.parts.solids import ring_sectors, to_manifold
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -202,7 +202,9 @@ def open_box():
     ("mesh", "keys", "says"),
     [
         (open_box(), {}, "not closed (3 open edges)"),
-        (trimesh.creation.box((60, 20, 10)), {"unit": "m"}, "is its unit right"),
+        (trimesh.creation.box((60, 20, 10)), {"unit": "m"}, "60000 mm long"),
+        (trimesh.creation.box((60, 20, 10)), {"unit": "m"}, "is it in m?"),
+        (trimesh.creation.box((99, 99, 90)), {}, "more than the gripper opens (85 mm)"),
         (trimesh.creation.box((60, 20, 1)), {}, "mm thick"),
         (trimesh.creation.box((60, 20, 10)), {"unit": "inch"}, "none of m, cm, mm"),
         (trimesh.creation.box((60, 20, 10)), {"density": -1}, "positive number"),
@@ -224,6 +226,14 @@ def test_a_bad_user_part_is_refused_in_one_line(tmp_path, mesh, keys, says):
         add_part(describe(tmp_path, mesh, **keys), tmp_path / "library")
     assert says in str(error.value) and "\n" not in str(error.value)
     assert not (tmp_path / "library" / "knob").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"solid\nendsolid\n", bytes(80) + bytes(4), b"x" * 200])
+def test_a_mesh_file_without_a_mesh_is_refused_in_one_line(tmp_path, content):
+    (tmp_path / "knob.stl").write_bytes(content)
+    with pytest.raises(PartError, match="knob.stl: (holds no triangles|cannot be read)") as error:
+        part_from_mesh(tmp_path / "knob.stl", "knob", "mm", density=1200)
+    assert "\n" not in str(error.value)
 
 
 def test_a_user_part_may_not_replace_a_configured_one(tmp_path):

@@ -30,6 +30,7 @@ KINDS = {
 }
 LONGEST = 0.17  # m: a slot of the tray (config/cell.yaml) is 0.18 m long
 THINNEST = 0.002  # m: thinner parts drown in the depth camera's noise
+THICKEST = 0.085  # m: the 2F-85 opens so far
 HEAVIEST = 4.0  # kg: the UR5 carries 5 kg, the gripper weighs 0.92
 USER_MARK = ".user"  # file in the folder of a part that did not come from config/parts.yaml
 
@@ -179,14 +180,12 @@ def make_library(config: Path, library: Path) -> int:
 
 
 _USER_KEYS = {"name", "family", "mesh", "unit", "density", "mass"}
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def part_from_description(description: Path) -> Part:
-    """A user's part from YAML: `name`, `mesh` (file beside the YAML: STL, OBJ, PLY, OFF), `unit`
-    (m, cm, mm), `density` (kg/m^3) or `mass` (kg), `family` (default: the name).
-
-    The mesh must be closed and fit workspace and robot. Convex pieces come from CoACD.
+    """A user's part from YAML: `name`, `mesh` (file beside the YAML), `unit` (m, cm, mm),
+    `density` (kg/m^3) or `mass` (kg), `family` (default: the name); see part_from_mesh.
     Raises PartError.
     """
     try:
@@ -204,10 +203,6 @@ def part_from_description(description: Path) -> Part:
         what += [f"key '{k}' is missing" for k in sorted(missing)]
         raise PartError(f"{description}: {', '.join(what)}")
     name = str(d["name"])
-    if not name or not all(c.isalnum() or c in "_-" for c in name):
-        raise PartError(f"{description}: name '{name}' may hold letters, digits, '_' and '-' only")
-    if str(d["unit"]) not in _UNITS:
-        raise PartError(f"{description}: unit '{d['unit']}' is none of m, cm, mm")
     given = [k for k in ("density", "mass") if k in d]
     if len(given) != 1:
         raise PartError(f"{description}: give either density (kg/m^3) or mass (kg)")
@@ -218,31 +213,58 @@ def part_from_description(description: Path) -> Part:
     path = description.parent / str(d["mesh"])
     if not path.is_file():
         raise PartError(f"{path}: no such mesh (named in {description})")
+    family = str(d.get("family", name))
+    return part_from_mesh(path, name, str(d["unit"]), family, **{given[0]: amount})
+
+
+def part_from_mesh(
+    path: Path,
+    name: str,
+    unit: str,
+    family: str | None = None,
+    *,
+    density: float | None = None,
+    mass: float | None = None,
+) -> Part:
+    """A part from a mesh file (STL, OBJ, PLY, OFF) in m, cm or mm, homogeneous, of a density
+    (kg/m^3) or a mass (kg).
+
+    The mesh must be closed and fit gripper, workspace and robot. Convex pieces come from CoACD.
+    Raises PartError.
+    """
+    if not name or not all(c.isalnum() or c in "_-" for c in name):
+        raise PartError(f"{path}: name '{name}' may hold letters, digits, '_' and '-' only")
+    if unit not in UNITS:
+        raise PartError(f"{path}: unit '{unit}' is none of {', '.join(UNITS)}")
+    if not path.is_file():
+        raise PartError(f"{path}: no such mesh")
     try:
         mesh = trimesh.load(path, force="mesh")
     except Exception as error:  # trimesh's loaders raise whatever their format's parser raises
         raise PartError(f"{path}: cannot be read as a mesh ({one_line(error)})") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise PartError(f"{path}: holds no triangles")
-    mesh.apply_scale(_UNITS[d["unit"]])
+    mesh.apply_scale(UNITS[unit])
     mesh.merge_vertices()
+    longest, shortest = 1e3 * mesh.extents.max(), 1e3 * mesh.extents.min()
+    wrong = f"is it in {unit}? Known units: {', '.join(UNITS)}"
+    if longest > 1e3 * LONGEST:
+        raise PartError(f"{path}: {longest:.0f} mm long, more than {1e3 * LONGEST:.0f} mm; {wrong}")
+    if shortest < 1e3 * THINNEST:
+        raise PartError(f"{path}: only {shortest:.2g} mm thick; {wrong}")
+    if shortest > 1e3 * THICKEST:
+        raise PartError(
+            f"{path}: {shortest:.0f} mm thick, more than the gripper opens "
+            f"({1e3 * THICKEST:.0f} mm); {wrong}"
+        )
     if not mesh.is_watertight:
         loose = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
         raise PartError(f"{path}: the mesh is not closed ({loose} open edges); close it first")
     trimesh.repair.fix_normals(mesh)
-    longest, shortest = 1e3 * mesh.extents.max(), 1e3 * mesh.extents.min()
-    if longest > 1e3 * LONGEST:
-        raise PartError(
-            f"{path}: {longest:.0f} mm long, more than {1e3 * LONGEST:.0f} mm; is its unit right?"
-        )
-    if shortest < 1e3 * THINNEST:
-        raise PartError(f"{path}: only {shortest:.2g} mm thick; is its unit right?")
-    mass = amount if given[0] == "mass" else amount * mesh.volume
+    mass = mass if density is None else density * mesh.volume
     if mass > HEAVIEST:
-        raise PartError(
-            f"{description}: {mass:.1f} kg, more than the robot carries ({HEAVIEST} kg)"
-        )
-    return make_part(name, str(d.get("family", name)), mesh, convex_pieces(mesh), mass=mass)
+        raise PartError(f"{path}: {mass:.1f} kg, more than the robot carries ({HEAVIEST} kg)")
+    return make_part(name, family or name, mesh, convex_pieces(mesh), mass=mass)
 
 
 def convex_pieces(mesh: trimesh.Trimesh, concavity: float = 0.05) -> list[trimesh.Trimesh]:
@@ -258,12 +280,15 @@ def convex_pieces(mesh: trimesh.Trimesh, concavity: float = 0.05) -> list[trimes
 
 def add_part(description: Path, library: Path) -> Part:
     """Adds a user's part to the library (see part_from_description). Raises PartError."""
-    part = part_from_description(description)
+    return add_to_library(part_from_description(description), library)
+
+
+def add_to_library(part: Part, library: Path) -> Part:
+    """Adds a user's part, in place of an earlier one of that name. Raises PartError when
+    config/parts.yaml has the name."""
     configured = library / part.name / "part.yaml"
     if configured.is_file() and not (library / part.name / USER_MARK).is_file():
-        raise PartError(
-            f"{description}: '{part.name}' is a part of config/parts.yaml; choose another name"
-        )
+        raise PartError(f"'{part.name}' is a part of config/parts.yaml; choose another name")
     save_part(part, library)
     (library / part.name / USER_MARK).touch()
     return part
