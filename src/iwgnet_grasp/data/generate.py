@@ -17,16 +17,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import ctypes
 import fcntl
+import io
 import json
-import multiprocessing
-import os
 import shutil
 import signal
 from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,12 +33,24 @@ import numpy as np
 import typer
 import yaml
 from PIL import Image
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.jacquard import format_grasps
+from iwgnet_grasp.data.lift_check import as_text, plan_check, summary
+from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
+from iwgnet_grasp.files import write_whole
+from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
-from iwgnet_grasp.perception.types import Box
+from iwgnet_grasp.perception.types import Box, Window
 
 PACKAGE = Path(__file__).resolve().parents[3]
 CONFIG = PACKAGE / "config" / "dataset.yaml"
@@ -62,12 +71,19 @@ def pile_rng(seed: int, pile: int, attempt: int = 0) -> np.random.Generator:
 class SceneMaker:
     """Draws, renders and labels scenes with one simulated cell."""
 
-    def __init__(self, families: list[str], settings: dict, package_dir: Path = PACKAGE) -> None:
+    def __init__(
+        self,
+        families: list[str],
+        settings: dict,
+        package_dir: Path = PACKAGE,
+        detector: bool = True,
+    ) -> None:
         from iwgnet_grasp import _core  # only here: training machines have no extension
 
         self.core = _core
         self.families = families
         self.settings = settings
+        self.detector = detector  # whether colour images are made
         self.cell = _core.SimulatedCell(str(package_dir))
         self.labeler = _core.GraspLabeler(str(package_dir / "config"))
 
@@ -98,6 +114,8 @@ class SceneMaker:
             self.dress(rng)
             scene = self.observe(rng)
             scene.arrangement = spec.arrangement.name.lower()
+            scene.poses, scene.camera = self.cell.part_poses(), copy.copy(self.cell.camera)
+            scene.laid_away = slot
             yield scene
 
     def spec(self, rng: np.random.Generator) -> Any:
@@ -186,7 +204,7 @@ class SceneMaker:
     def observe(self, rng: np.random.Generator) -> Scene:
         """Images with and without parts, and the labels."""
         cell = self.cell
-        color = cell.color()
+        color = cell.color() if self.detector else self.skip_frame()
         ideal, mask = cell.ideal_depth(), cell.part_mask()
         stereo = cell.aligned_depth(cell.depth())
         outline_areas = cell.unoccluded_areas()
@@ -204,9 +222,20 @@ class SceneMaker:
                 [rectangle_row(label) for label in labels if label.part == part], np.float32
             ).reshape(-1, COLUMNS)
             box = bounding_box(seen)
-            detected = as_detected(box, color.shape, self.settings["crop"], rng)
+            detected = as_detected(box, ideal.shape, self.settings["crop"], rng)
             objects.append(SceneObject(part, family, seen, box, detected, rows))
         return Scene(color, ideal, empty_ideal, stereo, empty_stereo, objects)
+
+    def skip_frame(self) -> None:
+        """Counts as a colour image without being one: the noise of the depth images is drawn by
+        the number of images before, so that it is the same with and without colour."""
+        whole, small = copy.copy(self.cell.camera), copy.copy(self.cell.camera)
+        k = small.color
+        k.width = k.height = 8
+        small.color = k
+        self.cell.camera = small
+        self.cell.color()
+        self.cell.camera = whole
 
     def visible(self, seen: np.ndarray, outline_area: float) -> np.ndarray | None:
         """The part's mask without crumbs; None when too little of it is seen."""
@@ -237,13 +266,17 @@ class SceneObject:
 class Scene:
     """All depths (H, W) float32 m of the colour camera, NaN where there is none."""
 
-    color: np.ndarray  # (H, W, 3) uint8 RGB
+    color: np.ndarray | None  # (H, W, 3) uint8 RGB; None without detector
     ideal: np.ndarray
     empty_ideal: np.ndarray
     stereo: np.ndarray
     empty_stereo: np.ndarray
     objects: list[SceneObject]
     arrangement: str = ""  # scattered or stacked
+    # How to set the scene up again (lift_check):
+    poses: np.ndarray | None = None  # (parts, 4, 4) T_base_part
+    camera: Any = None  # _core.CameraConfig
+    laid_away: int = 0  # parts that lie in the tray
 
 
 def rectangle_row(label: Any) -> list[float]:
@@ -279,48 +312,62 @@ def as_detected(box: np.ndarray, image_shape: tuple, crop: dict, rng: np.random.
 # On disk --------------------------------------------------------------------------------------
 
 
-def write_scene(scene: Scene, number: int, out: Path, categories: list[str]) -> None:
-    """Writes one scene; its folder is renamed into place when everything else is written."""
-    images = out / "detector" / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    write_image(images / f"{number:06d}.png", scene.color[:, :, ::-1])
-    folder = out / f".{number:06d}.part"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+def encode_scene(scene: Scene, number: int, categories: list[str]) -> dict[str, bytes]:
+    """Path in the data set -> content of all files of a scene."""
+    files = {}
+    if scene.color is not None:
+        files[f"detector/images/{number:06d}.png"] = png(scene.color[:, :, ::-1])
     for o in scene.objects:
-        if len(o.rectangles) == 0:
+        window, rows = crop(scene, o)
+        if len(rows) == 0:
             continue  # a part that nothing can be done with: the detector's business only
         perfect = crop_window(scene.ideal, scene.empty_ideal, o.detected, CROP_PX)
-        stereo = crop_window(scene.stereo, scene.empty_stereo, o.detected, CROP_PX)
-        window = slice(stereo.y, stereo.y + CROP_PX), slice(stereo.x, stereo.x + CROP_PX)
-        rows = o.rectangles.copy()
-        rows[:, X] -= stereo.x
-        rows[:, Y] -= stereo.y
-        rows = rows[((rows[:, [X, Y]] >= 0) & (rows[:, [X, Y]] <= CROP_PX - 1)).all(axis=1)]
-        if len(rows) == 0:
-            continue
-        stem = f"{o.part}_{number:06d}"
-        write_image(folder / f"{stem}_RGB.png", scene.color[window][:, :, ::-1])
-        write_depth(folder / f"{stem}_perfect_depth.tiff", perfect.depth)
-        write_depth(folder / f"{stem}_stereo_depth.tiff", stereo.depth)
-        write_image(folder / f"{stem}_mask.png", o.mask[window].astype(np.uint8) * 255)
-        (folder / f"{stem}_grasps.txt").write_text(format_grasps(rows), newline="")
-        (folder / f"{stem}_quality.txt").write_text(
-            "".join(f"{max(q, 1e-4):.4f}\n" for q in rows[:, QUALITY])
-        )
-    annotations = [annotation(o, categories) for o in scene.objects]
-    height, width = scene.color.shape[:2]
-    (folder / "detector.json").write_text(
-        json.dumps(
-            {
-                "width": width,
-                "height": height,
-                "arrangement": scene.arrangement,
-                "annotations": annotations,
-            }
-        )
-    )
-    folder.rename(out / f"{number:06d}")
+        cut = slice(window.y, window.y + CROP_PX), slice(window.x, window.x + CROP_PX)
+        quality = "".join(f"{max(q, 1e-4):.4f}\n" for q in rows[:, QUALITY])
+        stem = f"{number:06d}/{o.part}_{number:06d}"
+        if scene.color is not None:
+            files[f"{stem}_RGB.png"] = png(scene.color[cut][:, :, ::-1])
+        files[f"{stem}_perfect_depth.tiff"] = tiff(perfect.depth)
+        files[f"{stem}_stereo_depth.tiff"] = tiff(window.depth)
+        files[f"{stem}_mask.png"] = png(o.mask[cut].astype(np.uint8) * 255)
+        files[f"{stem}_grasps.txt"] = format_grasps(rows).encode()
+        files[f"{stem}_quality.txt"] = quality.encode()
+    height, width = scene.ideal.shape
+    description = {
+        "width": width,
+        "height": height,
+        "arrangement": scene.arrangement,
+        "annotations": [annotation(o, categories) for o in scene.objects],
+    }
+    files[f"{number:06d}/detector.json"] = json.dumps(description).encode()
+    return files
+
+
+def crop(scene: Scene, o: SceneObject) -> tuple[Window, np.ndarray]:
+    """The crop of an object from the D455's depth, and its rectangles whose centre lies in it,
+    (n, 6) data.grasp_rectangle in px of the crop."""
+    window = crop_window(scene.stereo, scene.empty_stereo, o.detected, CROP_PX)
+    rows = o.rectangles.copy()
+    rows[:, X] -= window.x
+    rows[:, Y] -= window.y
+    return window, rows[((rows[:, [X, Y]] >= 0) & (rows[:, [X, Y]] <= CROP_PX - 1)).all(axis=1)]
+
+
+def write_scene(files: dict[str, bytes], number: int, out: Path) -> None:
+    """Writes the files of encode_scene(); the scene's folder is renamed into place when everything
+    else is written. OSError when there is no room."""
+    name = f"{number:06d}"
+    folder = out / f".{name}.part"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for path, content in files.items():
+        inside = path.removeprefix(f"{name}/")
+        if inside != path:
+            (folder / inside).write_bytes(content)
+        else:
+            (out / path).parent.mkdir(parents=True, exist_ok=True)
+            write_whole(out / path, content)
+    folder.rename(out / name)
 
 
 def annotation(o: SceneObject, categories: list[str]) -> dict:
@@ -338,22 +385,24 @@ def annotation(o: SceneObject, categories: list[str]) -> dict:
     }
 
 
-def write_image(path: Path, image: np.ndarray) -> None:
-    """PNG, BGR or grey. DataError when it cannot be written."""
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise DataError(f"{path}: cannot be written")
+def png(image: np.ndarray) -> bytes:
+    """PNG of an image, BGR or grey."""
+    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
-def write_depth(path: Path, depth: np.ndarray) -> None:
-    """TIFF float32 m; -1 where there is no depth (Jacquard's mark). OSError when it cannot be
-    written. By Pillow: OpenCV writes float images without compression."""
+def tiff(depth: np.ndarray) -> bytes:
+    """TIFF float32 m; -1 where there is no depth (Jacquard's mark). By Pillow: OpenCV writes float
+    images without compression."""
     rounded = np.round(depth / DEPTH_STEP) * DEPTH_STEP
     stored = np.where(np.isfinite(depth), rounded, -1).astype(np.float32)
-    Image.fromarray(stored).save(path, compression="tiff_lzw")
+    stream = io.BytesIO()
+    Image.fromarray(stored).save(stream, format="TIFF", compression="tiff_lzw")
+    return stream.getvalue()
 
 
-def write_annotations(out: Path, categories: list[str]) -> tuple[int, int]:
-    """Gathers the scenes' annotations; returns the numbers of scenes and of crops."""
+def write_annotations(out: Path, categories: list[str], detector: bool) -> tuple[int, int]:
+    """Gathers the scenes' annotations where there are images for them; returns the numbers of
+    scenes and of crops."""
     images, annotations, crops = [], [], 0
     for file in sorted(out.glob("[0-9]*/detector.json")):
         number = int(file.parent.name)
@@ -375,56 +424,44 @@ def write_annotations(out: Path, categories: list[str]) -> tuple[int, int]:
         "annotations": annotations,
         "categories": [{"id": i + 1, "name": name} for i, name in enumerate(categories)],
     }
-    _replace(out / "detector" / "annotations.json", json.dumps(text))
+    if detector:
+        write_whole(out / "detector" / "annotations.json", json.dumps(text).encode())
     return len(images), crops
-
-
-def _replace(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 # The run --------------------------------------------------------------------------------------
 
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
-_maker: SceneMaker | None = None
 
-
-def _start_worker(families: list[str], settings: dict) -> None:
-    global _maker
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)  # no worker outlives the run
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the run
-    cv2.setNumThreads(1)
-    _maker = SceneMaker(families, settings)
-
-
-def _make(seed: int, pile: int, wanted: list[int], out: Path, categories: list[str]) -> int:
-    for look, scene in enumerate(_maker.pile(seed, pile)):
-        number = pile * LOOKS + look
-        if number in wanted:
-            write_scene(scene, number, out, categories)
-    return len(wanted)
-
-
-def open_dataset(out: Path, description: dict) -> None:
-    """Begins a set or goes on with it. DataError when the folder holds another one."""
+def open_dataset(out: Path, description: dict) -> dict:
+    """Begins a set or goes on with it; returns the content of dataset.json. DataError when the
+    folder holds another set."""
     path = out / "dataset.json"
     if path.is_file():
-        try:
-            old = json.loads(path.read_text())
-        except ValueError:
-            raise DataError(f"{path}: not JSON; remove the folder to begin anew") from None
-        same = ("seed", "families", "settings")
-        if any(old.get(key) != description[key] for key in same):
+        old = read_description(path)
+        # A set from before an entry was kept has nothing to compare it with.
+        same = ("seed", "families", "settings", "library", "detector")
+        if any(old.get(key, description[key]) != description[key] for key in same):
             raise DataError(
-                f"{out}: holds a data set of another seed, families or settings; "
+                f"{out}: holds a data set of another seed, families, parts or settings; "
                 "choose another --out or remove it"
             )
+        description = {**old, **description}
     elif out.is_dir() and any(out.glob("[0-9]*")):
         raise DataError(f"{out}: holds scenes but no dataset.json; choose another --out")
-    _replace(path, json.dumps(description, indent=2) + "\n")
+    write_json(path, description)
+    return description
+
+
+def read_description(path: Path) -> dict:
+    """dataset.json. DataError when it is none."""
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, TypeError, ValueError):
+        raise DataError(f"{path}: not JSON; remove the folder to begin anew") from None
+
+
+def write_json(path: Path, content: dict) -> None:
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def known_families(package_dir: Path = PACKAGE) -> list[str]:
@@ -438,30 +475,55 @@ def known_families(package_dir: Path = PACKAGE) -> list[str]:
 
 
 def generate_dataset(
-    scenes: int, seed: int, out: Path, families: list[str], workers: int, quiet: bool = False
+    scenes: int,
+    seed: int,
+    out: Path,
+    families: list[str],
+    workers: int,
+    quiet: bool = False,
+    *,
+    address: str | None = None,
+    lift_check: int = 0,
+    detector: bool = True,
+    package_dir: Path = PACKAGE,
 ) -> tuple[int, int]:
-    """Makes the scenes 0 .. scenes-1 that are not there yet; returns the numbers of scenes and
-    crops that the folder then holds. DataError for arguments that cannot be used. Whatever ends
-    the run, annotations.json then fits the scenes on disk."""
-    unknown = sorted(set(families) - set(known_families()))
+    """Makes the scenes 0 .. scenes-1 that are not there yet and lifts about `lift_check` labels of
+    the set; returns the numbers of scenes and crops that the folder then holds.
+
+    workers: processes of this machine, or actors on the Ray cluster at `address`; 0: one for each
+    core. detector: with colour images. DataError for arguments that cannot be used and when there
+    is no room on the disk. Whatever ends the run, annotations.json then fits the scenes on disk.
+    """
+    unknown = sorted(set(families) - set(known_families(package_dir)))
     if unknown or not families:
-        known = ", ".join(known_families())
+        known = ", ".join(known_families(package_dir))
         raise DataError(f"families: '{', '.join(unknown)}' not in the part library ({known})")
     settings = yaml.safe_load(CONFIG.read_text())
     # Detector classes: connecting_rod first wherever it takes part, then by name.
     categories = sorted(families, key=lambda name: (name != "connecting_rod", name))
-    with sole_writer(out):
-        open_dataset(
-            out, {"seed": seed, "scenes": scenes, "families": categories, "settings": settings}
-        )
-        missing = [i for i in range(scenes) if not (out / f"{i:06d}").is_dir()]
-        try:
-            if missing:
-                _run(missing, seed, out, categories, settings, workers, quiet)
-        finally:
-            for rest in out.glob(".*.part"):
-                shutil.rmtree(rest, ignore_errors=True)
-            counts = write_annotations(out, categories)
+    kind = SceneKind(tuple(categories), settings, library_digest(package_dir, families), detector)
+    description = {
+        "seed": seed,
+        "scenes": scenes,
+        "families": categories,
+        "library": kind.library,
+        "detector": detector,
+        "settings": settings,
+    }
+    try:
+        with sole_writer(out):
+            description = open_dataset(out, description)
+            try:
+                _fill(description, out, kind, workers, address, package_dir, lift_check, quiet)
+            finally:
+                for rest in out.glob(".*.part"):
+                    shutil.rmtree(rest, ignore_errors=True)
+                counts = write_annotations(out, categories, detector)
+    except OSError as error:
+        raise DataError(
+            f"{error.filename or out}: {error.strerror or error}; make room, then run the same "
+            "command again to go on"
+        ) from None
     return counts
 
 
@@ -477,62 +539,76 @@ def sole_writer(out: Path) -> Iterator[None]:
         yield
 
 
-def _run(
-    missing: list[int],
-    seed: int,
+def _fill(
+    description: dict,
     out: Path,
-    categories: list[str],
-    settings: dict,
+    kind: SceneKind,
     workers: int,
+    address: str | None,
+    package_dir: Path,
+    lift_check: int,
     quiet: bool,
 ) -> None:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    """Makes the scenes that are missing, then lifts the labels that are to be tried."""
+    seed, scenes = description["seed"], description["scenes"]
+    missing = [i for i in range(scenes) if not (out / f"{i:06d}").is_dir()]
+    lifts_file = out / "lifts.json"
+    lifts = read_description(lifts_file) if lifts_file.is_file() else {}
+    piles, labels = plan_check(scenes, LOOKS, lift_check) if lift_check else ([], 0)
+    looks = [pile * LOOKS + look for pile in piles for look in range(LOOKS)]
+    untried = [i for i in looks if i < scenes and str(i) not in lifts]
+    if not missing and not untried:
+        return
+    pool = open_pool(kind, workers, address, package_dir)
+    try:
+        with progress_bar(quiet) as bar:
+            task = bar.add_task(f"scenes in {out}", total=len(missing))
+            for files in _in_piles(pool, missing, "scenes", seed):
+                for number, content in files.items():
+                    write_scene(content, number, out)
+                bar.advance(task, len(files))
+            if untried:
+                task = bar.add_task("scenes with labels lifted", total=len(untried))
+            for tried in _in_piles(pool, untried, "lifts", seed, labels):
+                lifts |= {str(number): entries for number, entries in tried.items()}
+                write_whole(lifts_file, json.dumps(lifts).encode())
+                bar.advance(task, len(tried))
+    finally:
+        pool.close()
+    if lifts:
+        description["lift_check"] = summary([entry for i in lifts for entry in lifts[i]])
+        write_json(out / "dataset.json", description)
 
-    columns = (
+
+def _in_piles(
+    pool: ProcessPool | RayPool, numbers: list[int], method: str, seed: int, *arguments: Any
+) -> Iterator[Any]:
+    """SceneWorker.method(seed, pile, its numbers, ...) of all scenes' piles, as they are done."""
+    piles: dict[int, list[int]] = {}
+    for number in numbers:
+        piles.setdefault(number // LOOKS, []).append(number)
+    left = iter(piles.items())
+    running: set[Future] = set()
+    while True:
+        while len(running) < 2 * pool.size and (item := next(left, None)):
+            running.add(pool.submit(method, seed, *item, *arguments))
+        if not running:
+            return
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            yield pool.result(future)
+
+
+def progress_bar(quiet: bool) -> Progress:
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
+        disable=quiet,
     )
-    pool = ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(categories, settings),
-    )
-    piles: dict[int, list[int]] = {}
-    for number in missing:
-        piles.setdefault(number // LOOKS, []).append(number)
-    left = iter(piles.items())
-    running: set[Future] = set()
-    try:
-        with Progress(*columns, disable=quiet) as progress:
-            task = progress.add_task(f"scenes in {out}", total=len(missing))
-            while True:
-                for pile, wanted in left:
-                    running.add(pool.submit(_make, seed, pile, wanted, out, categories))
-                    if len(running) >= 2 * workers:
-                        break
-                if not running:
-                    return
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    progress.advance(task, future.result())
-    except BrokenProcessPool:
-        raise DataError(
-            "a worker died (out of memory?); run the same command again to go on"
-        ) from None
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def generate(
@@ -542,12 +618,57 @@ def generate(
         "data/train"
     ),
     families: Annotated[
-        str, typer.Option(help="Part families, comma-separated.")
-    ] = "connecting_rod",
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = os.cpu_count() or 1,
+        str | None,
+        typer.Option(
+            help="Part families of assets/parts, comma-separated; default: connecting_rod, or the "
+            "meshes alone where some are given."
+        ),
+    ] = None,
+    mesh: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A closed mesh of your own (STL, OBJ, PLY, OFF); joins the part library under its "
+            "file's name. Give it again for more."
+        ),
+    ] = None,
+    mesh_unit: Annotated[str, typer.Option(help="Of the meshes: m, cm or mm.")] = "mm",
+    mesh_density: Annotated[
+        float, typer.Option(help="Of the meshes, kg/m^3 (steel 7850, aluminium 2700).", min=1)
+    ] = 7850,
+    lift_check: Annotated[
+        int,
+        typer.Option(help="Labels that are lifted in Bullet to see whether they hold.", min=0),
+    ] = 100,
+    detector: Annotated[
+        bool, typer.Option(help="Make colour images, which the detector needs (1.5x the time).")
+    ] = True,
+    workers: Annotated[
+        int, typer.Option(help="Processes, or cores of the cluster; 0: all.", min=0)
+    ] = 0,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a Ray cluster (HOST:PORT, ray://HOST:PORT or auto); its machines have the "
+            "checkout at the same path."
+        ),
+    ] = None,
 ) -> None:
-    """Makes a data set for grasp network and detector in the simulator."""
-    names = [name.strip() for name in families.split(",") if name.strip()]
+    """Makes a data set for grasp network and detector in the simulator.
+
+    OUT is in Jacquard's layout, one folder a scene and one 300x300 crop an object; boxes and masks
+    for the detector are in OUT/detector. A run that was stopped goes on with the same command.
+
+    Examples:
+
+    iwgnet dataset --scenes 200 --out data/mine
+
+    iwgnet dataset --mesh valve.stl --mesh-unit mm --mesh-density 2700 --out data/valves
+
+    ray start --head --port 6379; iwgnet dataset --address HOST:6379 --workers 64
+    """
+    names = [name.strip() for name in (families or "").split(",") if name.strip()]
+    if families is None and not mesh:
+        names = ["connecting_rod"]
 
     def stop(*_):
         raise KeyboardInterrupt
@@ -555,14 +676,30 @@ def generate(
     signal.signal(signal.SIGINT, stop)  # a shell may have started it with SIGINT ignored
     signal.signal(signal.SIGTERM, stop)
     try:
-        made, crops = generate_dataset(scenes, seed, out, names, workers)
-    except DataError as error:
+        for path in mesh or []:
+            part = part_from_mesh(path, path.stem, mesh_unit, density=mesh_density)
+            add_to_library(part, PACKAGE / "assets" / "parts")
+            names.append(part.family)
+        made, crops = generate_dataset(
+            scenes,
+            seed,
+            out,
+            names,
+            workers,
+            address=address,
+            lift_check=lift_check,
+            detector=detector,
+        )
+    except (DataError, PartError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
         typer.echo(f"stopped; run the same command again to go on with {out}", err=True)
         raise typer.Exit(130) from None
     typer.echo(f"{out}: {made} scenes, {crops} object crops (seed {seed})")
+    report = read_description(out / "dataset.json").get("lift_check")
+    if report:
+        typer.echo(as_text(report))
 
 
 if __name__ == "__main__":

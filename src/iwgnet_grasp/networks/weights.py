@@ -1,8 +1,6 @@
 """Weights on disk: NAME.safetensors and its card NAME.json. No pickle is ever read."""
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import nn
 
+from iwgnet_grasp.files import write_whole
 from iwgnet_grasp.networks import create_network
 from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX, GraspNetwork
 
@@ -32,25 +31,11 @@ def weights_path(name_or_path: str | Path) -> Path:
 def save_weights(network: nn.Module, path: str | Path, card: dict[str, Any]) -> Path:
     """Writes PATH.safetensors and PATH.json, each whole or not at all."""
     path = weights_path(path).with_suffix(".safetensors")
-    path.parent.mkdir(parents=True, exist_ok=True)
     state = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     # The name travels in the file, too: a card can be mixed up with another's weights.
     write_whole(path, save(state, metadata={"network": str(card["network"])}))
     write_whole(path.with_suffix(".json"), (json.dumps(card, indent=2) + "\n").encode())
     return path
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes beside the file, then renames: a reader never sees half of it."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def read_card(name_or_path: str | Path) -> dict[str, Any]:
