@@ -30,9 +30,9 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import tifffile
 import typer
 import yaml
-from PIL import Image
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -391,12 +391,14 @@ def png(image: np.ndarray) -> bytes:
 
 
 def tiff(depth: np.ndarray) -> bytes:
-    """TIFF float32 m; -1 where there is no depth (Jacquard's mark). By Pillow: OpenCV writes float
-    images without compression."""
+    """TIFF float32 m; -1 where there is no depth (Jacquard's mark). Deflated: the readers of other
+    projects (imageio, tifffile) know LZW only with a codec package."""
     rounded = np.round(depth / DEPTH_STEP) * DEPTH_STEP
     stored = np.where(np.isfinite(depth), rounded, -1).astype(np.float32)
     stream = io.BytesIO()
-    Image.fromarray(stored).save(stream, format="TIFF", compression="tiff_lzw")
+    tifffile.imwrite(
+        stream, stored, compression="zlib", compressionargs={"level": 1}, metadata=None
+    )
     return stream.getvalue()
 
 
