@@ -1,3 +1,4 @@
+#include <pybind11/functional.h>
 #include <pybind11/stl.h>
 
 #include <map>
@@ -107,6 +108,9 @@ void bind_physics(py::module_& m) {
             c.step(steps);
           },
           "steps"_a = 1, "Advances by `steps` time steps.")
+      .def("watch", &SimulatedCell::watch, "period"_a, "watcher"_a,
+           "Calls watcher() about every `period` s of simulated time, also while a SimulatedRobot "
+           "moves; None ends it.")
       .def_property_readonly("time", &SimulatedCell::time, "s")
       .def_property_readonly("timestep", &SimulatedCell::timestep, "s")
       .def_property_readonly(

@@ -325,6 +325,9 @@ struct SimulatedCell::Impl {
 
   std::vector<PartModel> models;
   std::uint64_t seed = 0, frames = 0;
+
+  std::function<void()> watcher;
+  int watch_interval = 1, steps_to_watch = 0;
 };
 
 SimulatedCell::SimulatedCell(const std::string& package_dir, const std::string& config_dir)
@@ -357,7 +360,18 @@ void SimulatedCell::step(int steps) {
     m.gripper_controller.update(m.world, now);
     m.world.step();
     m.judge.observe(m.world, m.gripper_controller.goal());
+    if (m.watcher && --m.steps_to_watch <= 0) {
+      m.steps_to_watch = m.watch_interval;
+      m.watcher();
+    }
   }
+}
+
+void SimulatedCell::watch(double period, std::function<void()> watcher) {
+  if (!(period > 0)) throw Error("watch: the period must be above 0 s");
+  impl_->watch_interval = std::max(1, static_cast<int>(std::lround(period / timestep())));
+  impl_->steps_to_watch = 0;
+  impl_->watcher = std::move(watcher);
 }
 
 double SimulatedCell::time() const { return impl_->world.time(); }

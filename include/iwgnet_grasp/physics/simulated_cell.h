@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <opencv2/core.hpp>
 #include <string>
@@ -30,6 +31,9 @@ class SimulatedCell {
   int load_scene(const std::string& scene, std::uint64_t seed);
   int load_scene(const SceneSpec& spec, std::uint64_t seed);
   void step(int steps = 1);  // controllers, physics, judge
+  // Calls `watcher` about every `period` seconds of simulated time from within step(), whoever
+  // steps: for films. An empty function ends it.
+  void watch(double period, std::function<void()> watcher);
   double time() const;
   double timestep() const;
 
