@@ -51,6 +51,7 @@ class PriorityPlanner:
                 camera_intrinsics(grasps.camera_info),
                 self.config,
                 self.failed,
+                (grasps.scene_id,),
             )
         except PerceptionError as error:
             rospy.logerr(f"scene {grasps.scene_id}: {error}")

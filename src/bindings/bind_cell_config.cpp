@@ -57,6 +57,9 @@ void bind_cell_config(py::module_& m) {
           "Slot centres on the tray's floor in filling order, (3,) m each, base_link.");
   m.def("load_cell_config", &load_cell_config, "config_dir"_a,
         "Reads cell.yaml and camera.yaml of a folder.");
+  m.def(
+      "load_camera_pose", [](const std::string& path) { return to_matrix(load_camera_pose(path)); },
+      "path"_a, "(4, 4) T_base_color of a camera.yaml or of a calibration's result.");
 }
 
 }  // namespace iwgnet_grasp::bindings

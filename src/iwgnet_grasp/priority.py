@@ -30,6 +30,7 @@ class PriorityConfig:
     min_quality: float = 0.0  # a best grasp below it is tried after all others
     failed_radius_px: float = 15.0
     failed_angle_rad: float = math.radians(25.0)
+    random_order: bool = False  # S* is drawn, not computed: for comparison
 
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> PriorityConfig:
@@ -43,6 +44,7 @@ class PriorityConfig:
                 min_quality=float(text["min_quality"]),
                 failed_radius_px=float(text["failed_radius_px"]),
                 failed_angle_rad=math.radians(float(text["failed_angle_deg"])),
+                random_order=bool(text["random_order"]),
             )
         except OSError as error:
             raise PerceptionError(f"{path}: cannot be read ({error.strerror})") from error
@@ -88,6 +90,7 @@ def rank(
     camera: CameraIntrinsics,
     config: PriorityConfig,
     failed: Sequence[GraspRectangle] = (),
+    seed: Sequence[int] = (0,),
 ) -> Ranking:
     """Ranks objects by S* (Eq. 21), descending; equal S* keep the order of `objects`.
 
@@ -98,6 +101,7 @@ def rank(
     an object without any grasp left is dropped. Beyond the paper, whose score does not see the
     quality of a grasp: an object whose best grasp is below config.min_quality comes after all
     that are above, by ascending S, with S* = 0 and the reason, and does not count in Eq. 21.
+    With config.random_order `seed` draws S* of the objects that would have been scored.
     """
     scored: list[RankedObject] = []
     doubtful: list[RankedObject] = []
@@ -123,6 +127,9 @@ def rank(
         else:
             scored.append(RankedObject(left, depth_distance, distance, score, math.nan))
     priorities = normalised([entry.score for entry in scored])
+    if config.random_order:
+        priorities = np.random.default_rng(seed).permutation(len(scored)) / max(len(scored) - 1, 1)
+        priorities = [float(priority) for priority in priorities]
     scored = [replace(entry, priority=p) for entry, p in zip(scored, priorities, strict=True)]
     scored.sort(key=lambda entry: -entry.priority)  # stable
     doubtful.sort(key=lambda entry: entry.score)

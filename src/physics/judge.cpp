@@ -280,6 +280,7 @@ Verdict Judge::verdict(const World& world) const {
       pick.reason = "slipped";
     if (pick.reason.empty() && !delivered[pick.part]) pick.reason = "not_in_tray";
     pick.success = pick.reason.empty();
+    if (pick.part >= 0) pick.position = world.part(pick.part).T_base_part.translation();
     all = all && pick.success;
   }
   for (const auto& c : m.collisions) {
@@ -302,7 +303,11 @@ std::string to_json(const Verdict& v) {
     out << (i ? ", " : "") << "{\"part\": " << p.part << ", \"success\": " << p.success
         << ", \"reason\": " << quoted(p.reason) << ", \"slip_mm\": " << p.slip_mm
         << ", \"slip_deg\": " << p.slip_deg << ", \"grip_time\": " << p.grip_time
-        << ", \"release_time\": " << p.release_time << "}";
+        << ", \"release_time\": " << p.release_time;
+    if (p.part >= 0)
+      out << ", \"position\": [" << p.position.x() << ", " << p.position.y() << ", "
+          << p.position.z() << "]";
+    out << "}";
   }
   out << "], \"collisions\": [";
   for (std::size_t i = 0; i < v.collisions.size(); ++i)

@@ -192,11 +192,13 @@ def test_config_of_the_package_loads():
         ("alpha: 1", "missing"),
         ("alpha: x", "not a valid"),
         (
-            "alpha: -1\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1",
+            "alpha: -1\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1\n"
+            "random_order: false",
             "finite and >= 0",
         ),
         (
-            "alpha: .nan\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1",
+            "alpha: .nan\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1\n"
+            "random_order: false",
             "finite and >= 0",
         ),
     ],
@@ -207,3 +209,14 @@ def test_malformed_config_is_one_line_with_the_file(tmp_path, text, complaint):
     with pytest.raises(PerceptionError, match=complaint) as caught:
         PriorityConfig.load(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_random_order_is_drawn_by_the_seed_and_not_by_the_score():
+    objects = [thing(i, grasp(depth=0.5 + 0.01 * i), depth=0.5 + 0.01 * i) for i in range(6)]
+    config = replace(CONFIG, random_order=True)
+    orders = {seed: ids(rank(objects, CAMERA, config, seed=(seed,))) for seed in range(40)}
+    assert all(sorted(order) == list(range(6)) for order in orders.values())
+    assert orders[3] == ids(rank(objects, CAMERA, config, seed=(3,)))
+    assert {order[0] for order in orders.values()} == set(range(6))  # each comes first at times
+    priorities = [e.priority for e in rank(objects, CAMERA, config, seed=(3,)).objects]
+    assert priorities == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2, 0.0])

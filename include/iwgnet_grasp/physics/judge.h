@@ -16,6 +16,7 @@ struct PickVerdict {
   double slip_mm = 0.0;     // largest motion of the part in the gripper from grip to release
   double slip_deg = 0.0;
   double grip_time = 0.0, release_time = 0.0;  // s
+  Eigen::Vector3d position = Eigen::Vector3d::Zero();  // m in base_link: where the part now is
 };
 
 struct Verdict {

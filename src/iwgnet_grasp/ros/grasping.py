@@ -40,6 +40,8 @@ def run(options: argparse.Namespace, settings: Settings) -> Trial:
         f"bag_topics:={RECORDED}",
         f"config_dir:={options.config_dir.resolve()}",
     ]
+    if options.camera_offset >= 0:
+        launch.append(f"camera_offset_seed:={options.camera_offset}")
     trial = Trial(scene, options.seed, settings.replan, "ros")
     try:
         with Session("grasping.launch", launch, options.out / "log") as session:
@@ -109,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--record", required=True)
     parser.add_argument("--driver", required=True)
     parser.add_argument("--calibration", type=Path)
+    parser.add_argument("--camera-offset", type=int, default=-1)
     parser.add_argument("--config-dir", type=Path, default=PACKAGE / "config")
     parser.add_argument("--no-pictures", dest="pictures", action="store_false")
     parser.add_argument("--out", type=Path, required=True)

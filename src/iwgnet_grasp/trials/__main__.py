@@ -5,17 +5,26 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from iwgnet_grasp.cluster import ClusterError
 from iwgnet_grasp.supervisor import CellError
-from iwgnet_grasp.trials.batch import BatchError, Run, run_trials, scene_names
-from iwgnet_grasp.trials.overrides import OverrideError, parse_overrides
+from iwgnet_grasp.trials.batch import (
+    BatchError,
+    Run,
+    read_records,
+    read_run,
+    run_trials,
+    scene_names,
+)
+from iwgnet_grasp.trials.overrides import parse_overrides
 from iwgnet_grasp.trials.pool import PoolError
-from iwgnet_grasp.trials.progress import Progress
+from iwgnet_grasp.trials.progress import Progress, trial_line
 from iwgnet_grasp.trials.table import print_table
 from iwgnet_grasp.trials.worker import PACKAGE, Conditions
 
@@ -50,6 +59,9 @@ SetOption = Annotated[
 CalibrationOption = Annotated[
     Path | None, typer.Option(help="File with the camera pose to plan with; else the nominal one.")
 ]
+CameraOffsetOption = Annotated[
+    int, typer.Option(min=-1, help="Seed of what the camera's mounting is off by; -1: nothing.")
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -64,6 +76,7 @@ def run(
     address: AddressOption = None,
     changes: SetOption = [],  # noqa: B006
     calibration: CalibrationOption = None,
+    camera_offset: CameraOffsetOption = -1,
     out: Annotated[
         Path | None, typer.Option(help="Folder; one that holds this run is gone on with.")
     ] = None,
@@ -78,7 +91,11 @@ def run(
         return
     scenes = chosen_scenes(scene)
     conditions = Conditions(
-        replan.value, transport.value, parse_overrides(changes), _existing(calibration)
+        replan.value,
+        transport.value,
+        parse_overrides(changes),
+        _existing(calibration),
+        camera_offset,
     )
     out = out or PACKAGE / "results" / "runs" / f"{time.strftime('%Y%m%d-%H%M%S')}_{scene}"
     with Progress() as progress:
@@ -87,6 +104,57 @@ def run(
         )
     print_table(summary)
     typer.echo(f"trials and summary in {out}")
+
+
+@app.command("replay")
+def replay_command(
+    seed: Annotated[int, typer.Option(min=0, help="Of the trial.")],
+    scene: Annotated[str, typer.Option(help="Of config/scenes.yaml.")],
+    out: Annotated[Path, typer.Option(help="Folder for trial.json, pictures, strip and film.")],
+    like: Annotated[
+        Path | None, typer.Option(help="Folder of a run: its settings, and its trial to compare.")
+    ] = None,
+    replan: ReplanOption = Replan.every,
+    changes: SetOption = [],  # noqa: B006
+    calibration: CalibrationOption = None,
+    camera_offset: CameraOffsetOption = -1,
+    frames: Annotated[bool, typer.Option("--frames", help="Write each frame, too.")] = False,
+) -> None:
+    """Runs one trial of a table again, in process, and writes a film and a strip of it.
+
+    Example: scripts/run_trials replay --like DIR --scene ten_stacked --seed 7 --out DIR/replay
+
+    To watch it in rviz: scripts/start_grasping scene:=ten_stacked seed:=7 rviz:=true
+    """
+    from iwgnet_grasp.trials.replay import differences, replay, write_replay
+
+    scenes = chosen_scenes(scene)
+    if len(scenes) != 1:
+        raise BatchError(f"--scene {scene}: a replay is of one scene")
+    conditions = Conditions(
+        replan.value, "inprocess", parse_overrides(changes), _existing(calibration), camera_offset
+    )
+    before = None
+    if like is not None:
+        if changes or calibration or camera_offset >= 0 or replan is not Replan.every:
+            raise BatchError("--like: takes all settings from the run; give none beside it")
+        conditions = replace(read_run(like).conditions, transport="inprocess")
+        found = [r for r in read_records(like) if (r["scene"], r["seed"]) == (scene, seed)]
+        if not found:
+            raise BatchError(f"--like {like}: holds no trial of {scene} with seed {seed}")
+        before = found[0]
+    result = replay(conditions, scenes[0], seed)
+    paths = write_replay(result, out, frames)
+    typer.echo(trial_line(result.record))
+    if before is not None:
+        different = differences(before, result.record)
+        typer.echo(
+            f"differs from the trial in {like} in: {', '.join(different)}; the code, the settings "
+            f"or the backend changed since (commit {before.get('commit')})"
+            if different
+            else f"the same trial as in {like}"
+        )
+    typer.echo(f"wrote {', '.join(str(path) for path in paths)} and the pictures of each look")
 
 
 def checked_run(
@@ -142,7 +210,7 @@ def main() -> None:
         _end(" ".join(error.format_message().split()), 2)
     except (CellError, PoolError) as error:
         _end(str(error), 1)
-    except (BatchError, OverrideError, ValueError) as error:
+    except (BatchError, ClusterError, ValueError) as error:
         _end(str(error), 2)
     except OSError as error:
         _end(f"{error.filename or 'file'}: {error.strerror or error}", 2)

@@ -6,12 +6,13 @@ summary.json. The same settings go on where a killed run stopped; others are ref
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import yaml
@@ -20,7 +21,7 @@ from iwgnet_grasp.trials.overrides import changed_config
 from iwgnet_grasp.trials.pool import Task, run_here, run_with_ray
 from iwgnet_grasp.trials.record import write_json
 from iwgnet_grasp.trials.statistics import Record, summary
-from iwgnet_grasp.trials.worker import PACKAGE, Conditions
+from iwgnet_grasp.trials.worker import PACKAGE, Conditions, make_worker
 
 _NOT_OF_TRIALS = ("dataset.yaml", "detector_training.yaml")
 
@@ -88,9 +89,10 @@ def run_trials(
 def _records(
     conditions: Conditions, tasks: Sequence[Task], logs: Path, workers: int, address: str | None
 ) -> Iterator[Record]:
+    make = functools.partial(make_worker, conditions, logs.resolve())
     if workers == 1 and address is None:
-        return run_here(conditions, tasks, logs)
-    return run_with_ray(conditions, tasks, logs, workers, address)
+        return run_here(make, tasks)
+    return run_with_ray(make, tasks, workers, address)
 
 
 def read_records(out: Path) -> list[Record]:
@@ -115,6 +117,20 @@ def read_summary(out: Path) -> dict:
         return json.loads(path.read_text())
     except (OSError, json.JSONDecodeError) as error:
         raise BatchError(f"{path}: is not the summary of a run ({error})") from None
+
+
+def read_run(out: Path) -> Run:
+    """The run that a folder holds. Raises BatchError."""
+    path = out / "settings.json"
+    try:
+        settings = json.loads(path.read_text())
+        names = [f.name for f in fields(Conditions)]
+        conditions = Conditions(**{name: settings[name] for name in names})
+        return Run(
+            tuple(settings["scenes"]), settings["trials"], settings["first_seed"], conditions
+        )
+    except (OSError, json.JSONDecodeError, KeyError, TypeError):
+        raise BatchError(f"{out}: is not the folder of a run (no usable settings.json)") from None
 
 
 def _claim(out: Path, run: Run) -> None:

@@ -102,12 +102,13 @@ class InProcessCell:
             look = self._perception.look(color, depth, self._empty_depth)
         except PerceptionError as error:
             raise CellError(str(error)) from None
-        camera = self.simulated.camera
+        camera = self.simulated.config.camera
         if self._T_base_color is not None:
             camera.T_base_color = self._T_base_color
         k = camera.color
         intrinsics = CameraIntrinsics(k.fx, k.fy, k.cx, k.cy)
-        ranking = rank(look.objects, intrinsics, self._priority, failed)
+        seed = self._pick_config.seed, scene_id
+        ranking = rank(look.objects, intrinsics, self._priority, failed, seed)
         heights = self._core.HeightMap(depth, k, camera.T_base_color, self.simulated.config)
         self._pick_and_place.set_heights(heights)
         self._poses = {}

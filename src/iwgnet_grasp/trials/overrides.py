@@ -69,7 +69,7 @@ def _apply(config_dir: Path, key: str, value: Any) -> None:
         if i < len(steps) - 1:
             node = node[step]
     old = node[steps[-1]]
-    if _kind(old) != _kind(value):
+    if old is not None and _kind(old) != _kind(value):  # null says nothing of its kind
         raise OverrideError(f"--set {key}={value}: must be {_kind(old)}, as {old!r} is")
     if isinstance(old, float) and isinstance(value, int):
         value = float(value)

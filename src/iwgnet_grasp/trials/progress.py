@@ -63,7 +63,8 @@ class Progress:
         self._good += record["success"]
         self._show()
         if not record["success"] or not self._console.is_terminal:
-            self.say(_line(record) + ("" if self._console.is_terminal else f"  [{self._rate()}]"))
+            rate = "" if self._console.is_terminal else f"  [{self._rate()}]"
+            self.say(trial_line(record) + rate)
 
     def say(self, line: str) -> None:
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -76,7 +77,8 @@ class Progress:
         self._bars.update(self._task, completed=self.finished, rate=self._rate())
 
 
-def _line(record: Record) -> str:
+def trial_line(record: Record) -> str:
+    """A trial's end in one line."""
     good = sum(pick["success"] for pick in record["picks"])
     line = (
         f"{'success' if record['success'] else 'FAILED '}  {record['scene']} seed {record['seed']}"

@@ -78,6 +78,7 @@ def pick_entry(attempt: Attempt, verdict: Verdict | None) -> dict:
         "slip_deg": None,
         "part": None,
         "position": None,
+        "grip_time_s": None,
         "tray_slot": attempt.tray_slot,
         "look": target.scene_id,
         "label": target.label,
@@ -107,6 +108,7 @@ def pick_entry(attempt: Attempt, verdict: Verdict | None) -> dict:
         entry["slip_deg"] = round(max(pick["slip_deg"] for pick in judged), 3)
         entry["part"] = worst["part"] if worst["part"] >= 0 else None
         entry["position"] = worst.get("position")
+        entry["grip_time_s"] = round(worst["grip_time"], 3)
     return entry
 
 

@@ -10,13 +10,18 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials.overrides import changed_config
+from iwgnet_grasp.trials.pool import Worker
 from iwgnet_grasp.trials.statistics import Record
+
+if TYPE_CHECKING:
+    from iwgnet_grasp.trials.in_process import Plan
 
 PACKAGE = Path(__file__).resolve().parents[3]
 
@@ -29,17 +34,16 @@ class Conditions:
     transport: str = "inprocess"  # inprocess | ros
     overrides: dict[str, Any] = field(default_factory=dict)  # FILE.KEY -> value
     calibration: str = ""  # file with the camera pose that the planner uses; '': the nominal one
-
-
-class Worker(Protocol):
-    def run(self, scene: str, seed: int) -> Record:
-        """One trial. Raises CellError, ValueError or OSError when none can be run at all."""
-
-    def close(self) -> None: ...
+    camera_offset: int = -1  # seed of what the camera's mounting is off by; -1: nothing
 
 
 def make_worker(conditions: Conditions, log_dir: Path) -> Worker:
-    return (RosWorker if conditions.transport == "ros" else InProcessWorker)(conditions, log_dir)
+    """log_dir: for the logs of failed trials over ROS."""
+    return (
+        RosWorker(conditions, log_dir)
+        if conditions.transport == "ros"
+        else InProcessWorker(conditions)
+    )
 
 
 class _Configured:
@@ -70,7 +74,7 @@ class _Configured:
 class InProcessWorker(_Configured):
     """Keeps networks and cell loaded from trial to trial."""
 
-    def __init__(self, conditions: Conditions, log_dir: Path) -> None:
+    def __init__(self, conditions: Conditions) -> None:
         super().__init__(conditions)
         from iwgnet_grasp.perception import load_perception
         from iwgnet_grasp.trials.in_process import InProcessCell, load_calibration
@@ -79,8 +83,10 @@ class InProcessWorker(_Configured):
         self.backend = perception.estimator.backend
         calibrated = load_calibration(conditions.calibration) if conditions.calibration else None
         self.cell = InProcessCell(perception, config_dir=self._config_dir, T_base_color=calibrated)
+        if conditions.camera_offset >= 0:
+            self.cell.simulated.offset_camera(conditions.camera_offset)
 
-    def run(self, scene: str, seed: int) -> Record:
+    def run(self, scene: str, seed: int, on_plan: Callable[[Plan], None] | None = None) -> Record:
         from iwgnet_grasp.trials import in_process
 
         trial = in_process.run(
@@ -88,6 +94,7 @@ class InProcessWorker(_Configured):
             seed,
             self._conditions.replan,
             cell=self.cell,
+            on_plan=on_plan,
             say=lambda line: None,
             config_dir=self._config_dir,
         )
@@ -107,6 +114,7 @@ class RosWorker(_Configured):
         out = self._log_dir / f"{scene}_{seed}"
         command = [sys.executable, "-m", "iwgnet_grasp.ros.grasping"]
         command += ["--scene", scene, "--seed", str(seed), "--replan", self._conditions.replan]
+        command += ["--camera-offset", str(self._conditions.camera_offset)]
         command += ["--config-dir", str(self._config_dir), "--out", str(out), "--no-pictures"]
         if self._conditions.calibration:
             command += ["--calibration", self._conditions.calibration]
