@@ -144,9 +144,34 @@ void bind_physics(py::module_& m) {
             return to_numpy<float>(aligned);
           },
           "depth"_a, "The depth image in the colour frame, (H, W) float32 m, NaN invalid")
-      .def_property("camera", &SimulatedCell::camera, &SimulatedCell::set_camera,
-                    "A copy of the camera in use; assign to change it. A new scene resets it.")
+      .def_property(
+          "camera", [](const SimulatedCell& c) { return CameraConfig(c.camera()); },
+          &SimulatedCell::set_camera,
+          "A copy of the camera in use; assign to change it. A new scene resets it.")
+      .def("offset_camera", &SimulatedCell::offset_camera, "seed"_a,
+           "Hangs the camera off its nominal pose by what the seed draws, in this and later scenes.")
+      .def(
+          "hold_board",
+          [](SimulatedCell& c,
+             const py::array_t<std::uint8_t, py::array::c_style | py::array::forcecast>& print,
+             std::uint64_t seed) {
+            if (print.ndim() != 2) throw Error("print: expected shape (height, width)");
+            c.hold_board(cv::Mat(static_cast<int>(print.shape(0)),
+                                 static_cast<int>(print.shape(1)), CV_8UC1,
+                                 const_cast<std::uint8_t*>(print.data())),
+                         seed);
+          },
+          "print"_a, "seed"_a,
+          "Bolts a calibration board with this print (H, W) uint8 albedo to the gripper.")
+      .def(
+          "measure_board",
+          [](const SimulatedCell& c, std::uint64_t index) {
+            return to_matrix(c.measure_board(index));
+          },
+          "index"_a, "(4, 4) T_camera_board with the noise of simulated target poses")
       // Ground truth: for the judge, for labels and for pictures only.
+      .def_property_readonly(
+          "T_tool_board", [](const SimulatedCell& c) { return to_matrix(c.T_tool_board()); })
       .def(
           "verdict", [](const SimulatedCell& c) { return physics::to_json(c.verdict()); },
           "The judge's verdict on the trial so far, JSON.")

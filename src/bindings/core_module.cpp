@@ -15,6 +15,8 @@ PYBIND11_MODULE(_core, m) {
   bind_grasping(m);
   bind_motion(m);
   bind_physics(m);
+  bind_planning(m);
+  bind_calibration(m);
 }
 
 }  // namespace iwgnet_grasp::bindings

@@ -62,5 +62,7 @@ void bind_sensing(py::module_& m);
 void bind_grasping(py::module_& m);
 void bind_physics(py::module_& m);
 void bind_motion(py::module_& m);
+void bind_planning(py::module_& m);
+void bind_calibration(py::module_& m);
 
 }  // namespace iwgnet_grasp::bindings

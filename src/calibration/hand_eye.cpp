@@ -5,31 +5,10 @@
 #include <cmath>
 #include <cstdio>
 
+#include "geometry.h"
+
 namespace iwgnet_grasp::calibration {
 namespace {
-
-using Vector6 = Eigen::Matrix<double, 6, 1>;
-
-Eigen::Vector3d rotation_vector(const Eigen::Matrix3d& R) {
-  const Eigen::AngleAxisd turn(R);
-  return turn.angle() * turn.axis();
-}
-
-Eigen::Matrix3d cross(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d m;
-  m << 0, -v.z(), v.y(), v.z(), 0, -v.x(), -v.y(), v.x(), 0;
-  return m;
-}
-
-// T turned and moved by a small step (m, rad) in its own axes.
-Pose moved(const Pose& T, const Vector6& step) {
-  Pose result = T;
-  const Eigen::Vector3d turn = step.tail<3>();
-  const double angle = turn.norm();
-  if (angle > 0) result.linear() = T.linear() * Eigen::AngleAxisd(angle, turn / angle);
-  result.translation() += T.linear() * step.head<3>();
-  return result;
-}
 
 // What is left between the measured and the predicted target pose, in the target's frame.
 Pose discrepancy(const PosePair& pair, const Pose& X, const Pose& Y) {
@@ -40,12 +19,6 @@ Vector6 residual(const Pose& M) {
   Vector6 r;
   r << M.translation(), rotation_vector(M.linear());
   return r;
-}
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
 }
 
 std::string text(const char* format, double a, double b = 0.0) {
@@ -159,7 +132,9 @@ HandEyeResult refine(const std::vector<PosePair>& pairs, const Pose& T_base_came
   std::vector<double> weights(count, 1.0);
   Eigen::Matrix<double, 12, 12> H;
   bool converged = false;
-  constexpr int kMaxIterations = 50;
+  constexpr int kMaxIterations = 100;
+  constexpr int kScaleIterations = 8;  // then the scale stays: it would chase its own weights
+  double scale = 0.0;
   constexpr double kTukey = 4.685;  // 95 % efficiency on Gaussian noise
   for (int iteration = 0; iteration < kMaxIterations && !converged; ++iteration) {
     result.iterations = iteration + 1;
@@ -172,7 +147,7 @@ HandEyeResult refine(const std::vector<PosePair>& pairs, const Pose& T_base_came
       distance[i] = r[i].norm() / std::sqrt(6.0);
     }
     // The first steps, from a rough start, take every pair but bound its pull (Huber).
-    const double scale = std::max(median(distance), 1e-6);
+    if (iteration < kScaleIterations) scale = std::max(median(distance), 1e-6);
     for (std::size_t i = 0; i < count; ++i) {
       const double d = distance[i] / scale;
       if (iteration < 3) {
@@ -212,7 +187,7 @@ HandEyeResult refine(const std::vector<PosePair>& pairs, const Pose& T_base_came
     }
     X = moved(X, step.head<6>());
     Y = moved(Y, step.tail<6>());
-    converged = iteration >= 4 && step.norm() < 1e-9;
+    converged = iteration >= 4 && step.norm() < 1e-8;
   }
   if (!converged) {
     result.reason = "no convergence after " + std::to_string(kMaxIterations) +
@@ -252,6 +227,22 @@ HandEyeResult refine(const std::vector<PosePair>& pairs, const Pose& T_base_came
   result.covariance = (H.inverse() * (chi2 / freedom)).topLeftCorner<6, 6>();
   result.success = true;
   return result;
+}
+
+std::pair<double, double> axxb_rms(const std::vector<PosePair>& pairs, const Pose& X) {
+  double translation = 0, rotation = 0;
+  int motions = 0;
+  for (std::size_t i = 0; i < pairs.size(); ++i)
+    for (std::size_t j = i + 1; j < pairs.size(); ++j) {
+      const Pose A = pairs[j].T_base_tool * pairs[i].T_base_tool.inverse();
+      const Pose B = pairs[j].T_camera_target * pairs[i].T_camera_target.inverse();
+      const Vector6 r = residual((A * X).inverse() * X * B);
+      translation += r.head<3>().squaredNorm();
+      rotation += r.tail<3>().squaredNorm();
+      ++motions;
+    }
+  if (motions == 0) return {0.0, 0.0};
+  return {std::sqrt(translation / motions), std::sqrt(rotation / motions)};
 }
 
 std::pair<double, double> leave_one_out_spread(const std::vector<PosePair>& pairs,

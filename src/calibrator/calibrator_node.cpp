@@ -3,12 +3,10 @@
 // Beyond it: ~eye_to_hand, stamped pairs on `pair`, a maximum-likelihood refinement, residuals on
 // ~result, and a refusal with its reason in place of a wrong matrix.
 //
-// This executable links libvisp (GPL-2+) and is therefore under the GPL as a whole; nothing else in
-// the package links it.
+// This executable links libvisp (GPL-2+) and is therefore under the GPL as a whole.
 #include <iwgnet_grasp/CalibrationPair.h>
 #include <iwgnet_grasp/HandEyeResult.h>
 #include <ros/ros.h>
-#include <visp3/vision/vpHandEyeCalibration.h>
 #include <visp_hand2eye_calibration/TransformArray.h>
 #include <visp_hand2eye_calibration/compute_effector_camera.h>
 #include <visp_hand2eye_calibration/compute_effector_camera_quick.h>
@@ -17,6 +15,7 @@
 #include <tuple>
 
 #include "iwgnet_grasp/calibration/hand_eye.h"
+#include "visp_solver.h"
 
 namespace iwgnet_grasp {
 namespace {
@@ -43,36 +42,6 @@ geometry_msgs::Transform to_message(const Pose& T) {
   message.translation.y = T.translation().y();
   message.translation.z = T.translation().z();
   return message;
-}
-
-vpHomogeneousMatrix to_visp(const Pose& T) {
-  vpHomogeneousMatrix M;
-  for (unsigned r = 0; r < 4; ++r)
-    for (unsigned c = 0; c < 4; ++c) M[r][c] = T.matrix()(r, c);
-  return M;
-}
-
-Pose from_visp(const vpHomogeneousMatrix& M) {
-  Pose T = Pose::Identity();
-  for (unsigned r = 0; r < 3; ++r)
-    for (unsigned c = 0; c < 4; ++c) T.matrix()(r, c) = M[r][c];
-  return T;
-}
-
-// ViSP solves for the camera on the effector. The camera in the room is the same problem with the
-// robot's poses inverted: the base then moves before the tool.
-Pose solve_with_visp(const std::vector<calibration::PosePair>& pairs) {
-  std::vector<vpHomogeneousMatrix> cMo, rMe;
-  for (const auto& pair : pairs) {
-    cMo.push_back(to_visp(pair.T_camera_target));
-    rMe.push_back(to_visp(pair.T_base_tool.inverse()));
-  }
-  vpHomogeneousMatrix eMc;
-  switch (vpHandEyeCalibration::calibrate(cMo, rMe, eMc)) {
-    case 0: return from_visp(eMc);
-    case -1: throw Error("ViSP: too little rotation between the poses; turn and tilt the target more");
-    default: throw Error("ViSP: no convergence; the pairs contradict each other");
-  }
 }
 
 class Calibrator {
@@ -131,9 +100,24 @@ class Calibrator {
     if (!refusal.empty()) throw Error("calibrator: " + refusal);
     const Pose start = solve_with_visp(pairs);
     const auto result = calibration::refine(pairs, start, noise_, limits_);
-    if (!result.success) throw Error("calibrator: " + result.reason);
+    if (!result.success)
+      throw Error("calibrator: " + result.reason +
+                  (fits_other_set_up(pairs) ? std::string("; they fit a camera ") +
+                                                  (eye_to_hand_ ? "on the effector (~eye_to_hand:=false)"
+                                                                : "in the room (~eye_to_hand:=true)")
+                                            : ""));
     publish(pairs, start, result);
     return to_message(result.T_base_camera);
+  }
+
+  // Whether the pairs are good ones with base and tool in each other's place.
+  bool fits_other_set_up(std::vector<calibration::PosePair> pairs) const {
+    for (auto& pair : pairs) pair.T_base_tool = pair.T_base_tool.inverse();
+    try {
+      return calibration::refine(pairs, solve_with_visp(pairs), noise_, limits_).success;
+    } catch (const std::exception&) {
+      return false;
+    }
   }
 
   void publish(const std::vector<calibration::PosePair>& pairs, const Pose& visp_solution,

@@ -18,24 +18,6 @@ PinholeIntrinsics intrinsics(const YamlFile& file, const std::string& key) {
   return k;
 }
 
-Pose pose(const YamlFile& file, const std::string& key) {
-  const auto rows = file.get<std::vector<std::vector<double>>>(key + ".rotation");
-  Eigen::Matrix3d rotation;
-  if (rows.size() != 3) file.fail(key + ".rotation", "needs 3 rows of 3 numbers");
-  for (int r = 0; r < 3; ++r) {
-    if (rows[r].size() != 3) file.fail(key + ".rotation", "needs 3 rows of 3 numbers");
-    for (int c = 0; c < 3; ++c) rotation(r, c) = rows[r][c];
-  }
-  const bool orthonormal = (rotation * rotation.transpose()).isIdentity(1e-3);
-  if (!orthonormal || rotation.determinant() < 0)
-    file.fail(key + ".rotation", "is not a rotation matrix");
-  Pose T = Pose::Identity();
-  // Rounded digits in the file must not leak into the frames.
-  T.linear() = Eigen::Quaterniond(rotation).normalized().toRotationMatrix();
-  T.translation() = file.vector(key + ".translation", 3);
-  return T;
-}
-
 CameraConfig load_camera(const std::string& path) {
   const YamlFile file(path);
   CameraConfig camera;
@@ -49,7 +31,7 @@ CameraConfig load_camera(const std::string& path) {
   camera.T_camera_link_depth.linear() << 0, 0, 1, -1, 0, 0, 0, -1, 0;
   camera.body_size = file.vector("body_size", 3);
   camera.body_center = file.vector("body_center", 3);
-  camera.T_base_color = pose(file, "T_base_color");
+  camera.T_base_color = file.pose("T_base_color");
   camera.subpixel_sigma_px = file.get<double>("noise.subpixel_sigma_px");
   camera.disparity_step_px = file.get<double>("noise.disparity_step_px");
   camera.lateral_sigma_px = file.get<double>("noise.lateral_sigma_px");
@@ -118,6 +100,6 @@ CellConfig load_cell_config(const std::string& config_dir) {
   return cell;
 }
 
-Pose load_camera_pose(const std::string& path) { return pose(YamlFile(path), "T_base_color"); }
+Pose load_camera_pose(const std::string& path) { return YamlFile(path).pose("T_base_color"); }
 
 }  // namespace iwgnet_grasp

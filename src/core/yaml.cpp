@@ -43,6 +43,24 @@ Eigen::VectorXd YamlFile::vector(const std::string& key, int size) const {
   return Eigen::Map<const Eigen::VectorXd>(values.data(), size);
 }
 
+Pose YamlFile::pose(const std::string& key) const {
+  const auto rows = get<std::vector<std::vector<double>>>(key + ".rotation");
+  Eigen::Matrix3d rotation;
+  if (rows.size() != 3) fail(key + ".rotation", "needs 3 rows of 3 numbers");
+  for (int r = 0; r < 3; ++r) {
+    if (rows[r].size() != 3) fail(key + ".rotation", "needs 3 rows of 3 numbers");
+    for (int c = 0; c < 3; ++c) rotation(r, c) = rows[r][c];
+  }
+  const bool orthonormal = (rotation * rotation.transpose()).isIdentity(1e-3);
+  if (!orthonormal || rotation.determinant() < 0)
+    fail(key + ".rotation", "is not a rotation matrix");
+  Pose T = Pose::Identity();
+  // Rounded digits in the file must not leak into the frames.
+  T.linear() = Eigen::Quaterniond(rotation).normalized().toRotationMatrix();
+  T.translation() = vector(key + ".translation", 3);
+  return T;
+}
+
 void YamlFile::fail(const std::string& key, const std::string& what) const {
   throw Error(path_ + ": key '" + key + "' " + what);
 }

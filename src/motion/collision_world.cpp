@@ -98,7 +98,11 @@ void CollisionWorld::set_gripper_gap(double gap) {
 }
 
 void CollisionWorld::set_attached(const std::optional<AttachedPart>& part) {
-  attached_ = part;
+  set_attached(part ? std::vector<AttachedPart>{*part} : std::vector<AttachedPart>{});
+}
+
+void CollisionWorld::set_attached(const std::vector<AttachedPart>& pieces) {
+  attached_ = pieces;
   rebuild();
 }
 
@@ -160,12 +164,12 @@ void CollisionWorld::rebuild() {
       row(kFingers, 6, mirrored({face + 0.005, y, pad_z - 0.014}), mirrored({face + 0.005, y, tip - 0.007}),
           0.007, 3);
   }
-  if (attached_) {
-    const double length = (attached_->b - attached_->a).norm();
-    const int count = std::clamp(1 + static_cast<int>(std::ceil(length / attached_->radius)), 2, 8);
+  for (const AttachedPart& piece : attached_) {
+    const double length = (piece.b - piece.a).norm();
+    const int count = std::clamp(1 + static_cast<int>(std::ceil(length / piece.radius)), 2, 8);
     const double step = length / (count - 1) / 2;
     const Eigen::Vector3d tcp(0, 0, pad_z);
-    row(kHeldPart, 6, tcp + attached_->a, tcp + attached_->b, std::hypot(attached_->radius, step), count);
+    row(kHeldPart, 6, tcp + piece.a, tcp + piece.b, std::hypot(piece.radius, step), count);
   }
   if (static_cast<int>(spheres_.size()) > kCapacity)
     throw Error("CollisionWorld: more than " + std::to_string(kCapacity) + " spheres");
@@ -246,7 +250,7 @@ template <typename Report>
 bool CollisionWorld::check(const JointVector& q, Report&& report) const {
   const Frames frames = kinematics::link_frames(q);
   const bool column = in_column(frames[kJoints - 1]);
-  const int last = attached_ && !column ? kHeldPart : kFingers;
+  const int last = !attached_.empty() && !column ? kHeldPart : kFingers;
 
   // Spheres around whole bodies come first; the spheres of a body are placed when it is near.
   Placed p;

@@ -6,6 +6,8 @@
 #include <control_msgs/GripperCommandAction.h>
 #include <control_msgs/JointTrajectoryControllerState.h>
 #include <cv_bridge/cv_bridge.h>
+#include <geometry_msgs/PoseStamped.h>
+#include <iwgnet_grasp/CalibrationTruth.h>
 #include <iwgnet_grasp/Judge.h>
 #include <iwgnet_grasp/LoadScene.h>
 #include <iwgnet_grasp/Step.h>
@@ -23,6 +25,7 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <opencv2/imgcodecs.hpp>
 #include <optional>
 
 #include "conversions.h"
@@ -124,6 +127,15 @@ class Simulator {
         gripper_server_(node_, Topics::GRIPPER_ACTION,
                         [this](GripperGoal goal) { on_gripper_goal(goal); },
                         [this](GripperGoal goal) { on_gripper_cancel(goal); }, false) {
+    // The seed of what is mounted by hand is apart from that of the scenes, which change.
+    const int camera_seed = ros::param::param("~camera_offset_seed", -1);
+    if (camera_seed >= 0) cell_.offset_camera(camera_seed);
+    const auto print = ros::param::param<std::string>("~board_print", "");
+    if (!print.empty()) {
+      const cv::Mat image = cv::imread(print, cv::IMREAD_GRAYSCALE);
+      if (image.empty()) throw Error("parameter ~board_print: '" + print + "' is no readable image");
+      cell_.hold_board(image, ros::param::param("~seed", 0));
+    }
     load(ros::param::param<std::string>("~scene", ""), ros::param::param("~seed", 0));
     clock_ = node_.advertise<rosgraph_msgs::Clock>("/clock", 10);
     publish_clock();  // before anything with a stamp
@@ -136,12 +148,14 @@ class Simulator {
     aligned_ = node_.advertise<sensor_msgs::Image>(Topics::ALIGNED_DEPTH_IMAGE, 2);
     aligned_info_ = node_.advertise<sensor_msgs::CameraInfo>(Topics::ALIGNED_DEPTH_INFO, 2);
     points_ = node_.advertise<sensor_msgs::PointCloud2>(Topics::POINTS, 1);
+    target_pose_ = node_.advertise<geometry_msgs::PoseStamped>(Topics::TARGET_POSE, 1);
     markers_ = node_.advertise<visualization_msgs::MarkerArray>(Topics::CELL_MARKERS, 1, true);
     command_ = node_.subscribe(Topics::ARM_COMMAND, 5, &Simulator::on_command, this);
     services_ = {node_.advertiseService(Topics::LOAD_SCENE, &Simulator::on_load_scene, this),
                  node_.advertiseService(Topics::RESET, &Simulator::on_reset, this),
                  node_.advertiseService(Topics::STEP, &Simulator::on_step, this),
-                 node_.advertiseService(Topics::JUDGE, &Simulator::on_judge, this)};
+                 node_.advertiseService(Topics::JUDGE, &Simulator::on_judge, this),
+                 node_.advertiseService(Topics::CALIBRATION_TRUTH, &Simulator::on_truth, this)};
     publish_camera_frames();
     publish_cell_markers();
     arm_server_.start();
@@ -209,7 +223,10 @@ class Simulator {
       const double time = cell_.time();
       if (joint_states_due_.due(time)) publish_arm_joints();
       if (gripper_state_due_.due(time)) publish_gripper_joint();
-      if (controller_state_due_.due(time)) publish_controller_state();
+      if (controller_state_due_.due(time)) {
+        publish_controller_state();
+        publish_target_pose();
+      }
     }
     publish_clock();
     check_arm();
@@ -276,6 +293,21 @@ class Simulator {
     feedback.actual = state.actual;
     feedback.error = state.error;
     arm_goal_->publishFeedback(feedback);
+  }
+
+  // The pose of the calibration board as a detector would report it, with the noise of
+  // config/calibration.yaml.
+  void publish_target_pose() {
+    if (target_pose_.getNumSubscribers() == 0) return;
+    geometry_msgs::PoseStamped pose;
+    pose.header = header(Topics::COLOR_FRAME);
+    try {
+      pose.pose = to_message(cell_.measure_board(target_poses_++));
+    } catch (const Error& error) {
+      ROS_ERROR_ONCE("simulator: %s: %s", Topics::TARGET_POSE.c_str(), error.what());
+      return;
+    }
+    target_pose_.publish(pose);
   }
 
   // Tolerances of a goal on top of the driver's: 0 keeps the default, negative lifts the limit.
@@ -625,6 +657,13 @@ class Simulator {
     return true;
   }
 
+  bool on_truth(CalibrationTruth::Request&, CalibrationTruth::Response& response) {
+    response.base_camera = to_transform_message(cell_.camera().T_base_color);
+    response.tool_board = to_transform_message(
+        cell_.has_board() ? cell_.T_tool_board() : Pose::Identity());
+    return true;
+  }
+
   const Settings settings_;
   physics::SimulatedCell cell_;
   std::string scene_;
@@ -633,14 +672,15 @@ class Simulator {
   bool paused_ = false;
   bool commanded_ = false;  // a trajectory from topic 5, without an action, is under way
   unsigned listeners_ = 0;
+  std::uint64_t target_poses_ = 0;
   ros::WallTime clock_wall_, frame_wall_, newcomer_wall_;
   Periodic joint_states_due_, gripper_state_due_, controller_state_due_, frame_due_;
 
   ros::NodeHandle node_;
   ros::Publisher clock_, joint_states_, state_, color_, color_info_, depth_, depth_info_, aligned_,
-      aligned_info_, points_, markers_;
+      aligned_info_, points_, target_pose_, markers_;
   ros::Subscriber command_;
-  std::array<ros::ServiceServer, 4> services_;
+  std::array<ros::ServiceServer, 5> services_;
   tf2_ros::StaticTransformBroadcaster broadcaster_;
   std::optional<ArmGoal> arm_goal_;
   std::optional<GripperGoal> gripper_goal_;

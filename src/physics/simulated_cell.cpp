@@ -7,10 +7,13 @@
 #include <cmath>
 #include <fstream>
 #include <map>
+#include <optional>
 #include <random>
 #include <sstream>
 
 #include "iwgnet_grasp/core/yaml.h"
+#include "iwgnet_grasp/kinematics/ur5.h"
+#include "iwgnet_grasp/physics/calibration_rig.h"
 #include "iwgnet_grasp/sensing/pinhole.h"
 
 namespace iwgnet_grasp::physics {
@@ -20,6 +23,7 @@ constexpr double kRestSpeed = 0.01;     // rad/s: the arm counts as at rest belo
 constexpr double kSettleTime = 0.5;     // s, longest wait for that after a trajectory
 constexpr double kGripTime = 4.0;       // s, twice the longest stroke at the slowest speed
 constexpr double kExecuteMargin = 2.0;  // s beyond a trajectory's end and its goal time
+constexpr double kBoardForce = 20.0;    // N, on the edge of the calibration board
 constexpr float kFloorHeight = -0.75f;  // m, of the hall's floor under the table
 
 std::string read_text(const std::string& path) {
@@ -77,7 +81,7 @@ TriangleMesh cylinder_mesh(double radius, double length) {
 struct Appearance {
   sensing::Light light;
   double color_noise_sigma = 0.0;
-  sensing::Material table, tray, mount, camera, floor, robot;
+  sensing::Material table, tray, mount, camera, floor, robot, board;
   std::vector<sensing::Material> parts;
 };
 
@@ -102,6 +106,7 @@ Appearance load_appearance(const std::string& config_dir) {
   a.mount = material(file, "mount");
   a.camera = material(file, "camera");
   a.floor = material(file, "floor");
+  a.board = material(file, "board");
   a.robot = material(file, "robot", false);
   const YAML::Node parts = file.node("parts");
   if (!parts.IsSequence() || parts.size() == 0) file.fail("parts", "needs a list of materials");
@@ -136,6 +141,7 @@ struct SimulatedCell::Impl {
         config_dir(configs),
         config(load_cell_config(configs)),
         camera(config.camera),
+        T_base_color(config.camera.T_base_color),
         urdf_xml(read_text(package + "/urdf/cell.urdf")),
         appearance(load_appearance(configs)),
         library(load_parts(package + "/assets/parts")),
@@ -228,11 +234,12 @@ struct SimulatedCell::Impl {
     models = parts;
     seed = scene_seed;
     frames = 0;
-    arm_controller.reset(config.observe_joints);
+    arm_controller.reset(home());
     gripper_controller.reset();
     judge.reset(world);
     light = appearance.light;
     camera = config.camera;
+    camera.T_base_color = T_base_color;
 
     renderer.clear_instances();
     link_visuals.clear();
@@ -254,7 +261,19 @@ struct SimulatedCell::Impl {
       part_instances.push_back(renderer.add_instance(
           part_meshes.at(models[i].name), appearance.parts[(start + i) % appearance.parts.size()],
           Pose::Identity()));
+    show_board();
     sync();
+  }
+
+  // Where the arm stands when a scene begins.
+  JointVector home() const { return board ? board->start_joints : config.observe_joints; }
+
+  // The board's drawings in a scene that has just been begun.
+  void show_board() {
+    if (!board) return;
+    board->sheet = renderer.add_instance(board->sheet_mesh, appearance.board, Pose::Identity());
+    board->plate = renderer.add_instance(board->plate_mesh, appearance.board, Pose::Identity());
+    gripper_controller.start(board->thickness, kBoardForce, world.time());
   }
 
   // The imagers look out of the body's front: what is drawn of it ends just behind them.
@@ -289,6 +308,11 @@ struct SimulatedCell::Impl {
     }
     for (std::size_t i = 0; i < part_instances.size(); ++i)
       renderer.set_pose(part_instances[i], world.part(static_cast<int>(i)).T_base_part);
+    if (board) {
+      const Pose T_base_board = kinematics::forward(world.arm().q) * board->T_tool_board;
+      renderer.set_pose(board->sheet, T_base_board);
+      renderer.set_pose(board->plate, T_base_board * Eigen::Translation3d(board->plate_center));
+    }
   }
 
   struct LinkDrawing {
@@ -296,6 +320,15 @@ struct SimulatedCell::Impl {
     int mesh;
     Pose T_link_visual;
     sensing::Material material;
+  };
+  struct Board {  // of the calibration rig
+    int sheet_mesh, plate_mesh;
+    Eigen::Vector3d plate_center;  // m, board frame
+    double thickness;              // m
+    Pose T_tool_board;
+    Offset noise;
+    JointVector start_joints;
+    int sheet = -1, plate = -1;    // instances of the scene
   };
   struct BoxDrawing {
     int mesh;
@@ -306,6 +339,7 @@ struct SimulatedCell::Impl {
   std::string package_dir, config_dir;
   CellConfig config;
   CameraConfig camera;
+  Pose T_base_color;  // of the camera in new scenes
   std::string urdf_xml;
   Appearance appearance;
   std::vector<PartModel> library;
@@ -322,6 +356,7 @@ struct SimulatedCell::Impl {
   std::vector<LinkVisual> link_visuals;
   std::vector<int> part_instances, camera_instances;
   int table_instance = -1;
+  std::optional<Board> board;
 
   std::vector<PartModel> models;
   std::uint64_t seed = 0, frames = 0;
@@ -344,7 +379,7 @@ int SimulatedCell::load_scene(const std::string& scene, std::uint64_t seed) {
 
 int SimulatedCell::load_scene(const SceneSpec& spec, std::uint64_t seed) {
   Impl& m = *impl_;
-  m.world.reset(m.config.observe_joints);
+  m.world.reset(m.home());
   std::vector<PartModel> parts;
   if (spec.count > 0) parts = build_scene(m.world, spec, m.config, m.library, seed);
   m.begin_scene(parts, seed);
@@ -415,6 +450,42 @@ const CameraConfig& SimulatedCell::camera() const { return impl_->camera; }
 void SimulatedCell::set_camera(const CameraConfig& camera) {
   impl_->camera = camera;
   impl_->place_camera();
+}
+
+void SimulatedCell::offset_camera(std::uint64_t seed) {
+  Impl& m = *impl_;
+  const Offset offset = load_calibration_rig(m.config_dir).camera_offset;
+  m.T_base_color = m.config.camera.T_base_color * draw_offset(offset, mix(seed, 101));
+  CameraConfig moved = m.camera;
+  moved.T_base_color = m.T_base_color;
+  set_camera(moved);
+}
+
+void SimulatedCell::hold_board(const cv::Mat& print, std::uint64_t seed) {
+  Impl& m = *impl_;
+  const CalibrationRig rig = load_calibration_rig(m.config_dir);
+  constexpr double kGap = 5e-5;  // m, the print above the plate, that they do not fight for pixels
+  Eigen::Vector3d size = rig.plate.size;
+  size.z() -= kGap;
+  m.board = Impl::Board{m.renderer.add_sheet(rig.print_size, print),
+                        m.renderer.add_box(size),
+                        rig.plate.center - Eigen::Vector3d(0, 0, kGap / 2),
+                        rig.plate.size.z(),
+                        rig.T_tool_board * draw_offset(rig.board_offset, mix(seed, 102)),
+                        rig.pose_noise, rig.start_joints};
+}
+
+bool SimulatedCell::has_board() const { return impl_->board.has_value(); }
+
+Pose SimulatedCell::T_tool_board() const {
+  if (!impl_->board) throw Error("the simulated gripper holds no calibration board");
+  return impl_->board->T_tool_board;
+}
+
+Pose SimulatedCell::measure_board(std::uint64_t index) const {
+  const Pose T_tool = T_tool_board();
+  return impl_->camera.T_base_color.inverse() * kinematics::forward(impl_->world.arm().q) * T_tool *
+         draw_noise(impl_->board->noise, mix(impl_->seed, 103), index);
 }
 
 World& SimulatedCell::world() { return impl_->world; }

@@ -21,11 +21,14 @@ constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr float kOcclusionRange = 0.08f;  // m, of ambient occlusion: the size of the parts
 constexpr float kSurfaceOffset = 2e-5f;   // m, keeps secondary rays off their own surface
 constexpr float kCrease = 0.77f;          // cos 40 deg: sharper edges are not shaded smooth
+constexpr int kPrintSamples = 6;          // a side of a pixel: the print's edges are smooth in the image
 constexpr float kFilterDepth = 0.004f;    // m, shadows are not smoothed across larger steps
 
 struct Mesh {
   RTCScene scene = nullptr;
   std::vector<std::array<Vec3, 3>> normals;  // of each triangle's corners, mesh frame
+  cv::Mat print;                             // of a sheet, CV_8UC1; else empty
+  float print_width = 0, print_height = 0;   // m
 };
 
 struct Instance {
@@ -259,6 +262,31 @@ struct Renderer::Impl {
     surface.normal = instance.R * surface.object_normal;
     return surface;
   }
+
+  // Mean albedo of the part of a printed sheet that a pixel covers.
+  float printed(const Instance& instance, const RayFrame& frame, const Packet& packet,
+                int lane) const {
+    const Mesh& mesh = meshes[instance.mesh];
+    const auto& ray = packet.hit.ray;
+    const Rotation& R = instance.R;
+    const Vec3 eye = transposed_times(R, frame.origin - instance.t);
+    const Vec3 middle =
+        transposed_times(R, Vec3{ray.dir_x[lane], ray.dir_y[lane], ray.dir_z[lane]});
+    const Vec3 right = transposed_times(R, frame.right), down = transposed_times(R, frame.down);
+    int sum = 0;
+    for (int i = 0; i < kPrintSamples; ++i)
+      for (int j = 0; j < kPrintSamples; ++j) {
+        const Vec3 d = middle + right * ((i + 0.5f) / kPrintSamples - 0.5f) +
+                       down * ((j + 0.5f) / kPrintSamples - 0.5f);
+        const float t = -eye.z / d.z;
+        const float x = (eye.x + t * d.x) / mesh.print_width + 0.5f;
+        const float y = 0.5f - (eye.y + t * d.y) / mesh.print_height;
+        sum += mesh.print.ptr<std::uint8_t>(
+            std::clamp(cvFloor(y * mesh.print.rows), 0, mesh.print.rows - 1))[std::clamp(
+            cvFloor(x * mesh.print.cols), 0, mesh.print.cols - 1)];
+      }
+    return sum / (255.0f * kPrintSamples * kPrintSamples);
+  }
 };
 
 Renderer::Renderer() : impl_(std::make_unique<Impl>()) {}
@@ -290,6 +318,19 @@ int Renderer::add_mesh(const TriangleMesh& mesh) {
 }
 
 int Renderer::add_box(const Eigen::Vector3d& size) { return add_mesh(box_mesh(size)); }
+
+int Renderer::add_sheet(const Eigen::Vector2d& size, const cv::Mat& print) {
+  if (print.type() != CV_8UC1 || print.empty() || !(size.minCoeff() > 0))
+    throw Error("renderer: a sheet needs a positive size and a print of type 8UC1");
+  const float x = size.x() / 2, y = size.y() / 2;
+  const int handle = add_mesh(
+      {{{-x, -y, 0}, {x, -y, 0}, {x, y, 0}, {-x, y, 0}}, {{0, 1, 2}, {0, 2, 3}}});
+  Mesh& mesh = impl_->meshes[handle];
+  mesh.print = print.clone();
+  mesh.print_width = size.x();
+  mesh.print_height = size.y();
+  return handle;
+}
 
 int Renderer::add_instance(int mesh, const Material& material, const Pose& T_base_instance) {
   if (mesh < 0 || mesh >= static_cast<int>(impl_->meshes.size()))
@@ -392,7 +433,13 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
         const Instance& instance = impl_->instances[packet.hit.hit.instID[0][i]];
         const Vec3 origin = surface.position + surface.face_normal * kSurfaceOffset;
         const Vec3 to_lamp = lighting.sample_lamp(i) - origin;
-        lighting.shade(surface, instance.material, instance.R, &direct_px, &ambient_px);
+        if (impl_->meshes[instance.mesh].print.empty()) {
+          lighting.shade(surface, instance.material, instance.R, &direct_px, &ambient_px);
+        } else {
+          Material printed = instance.material;
+          printed.albedo.setConstant(impl_->printed(instance, frame, packet, i));
+          lighting.shade(surface, printed, instance.R, &direct_px, &ambient_px);
+        }
         if (dot(to_lamp, surface.face_normal) > 0.0f) {
           lamp.valid[i] = -1;
           lamp.set(i, origin, to_lamp, 1.0f);

@@ -68,6 +68,10 @@ Pose mean_tool_target(const std::vector<PosePair>& pairs, const Pose& T_base_cam
 HandEyeResult refine(const std::vector<PosePair>& pairs, const Pose& T_base_camera_start,
                      const PoseNoise& noise = {}, const Limits& limits = {});
 
+// RMS of AX = XB over all motions between two pairs, {m, rad}: with A the motion of the tool in the
+// base, B the target's in the camera and X = T_base_camera, what (A X)^-1 X B differs from identity.
+std::pair<double, double> axxb_rms(const std::vector<PosePair>& pairs, const Pose& T_base_camera);
+
 // Largest change of T_base_camera when one pair is left out: {m, rad}.
 std::pair<double, double> leave_one_out_spread(const std::vector<PosePair>& pairs,
                                                const HandEyeResult& result, const PoseNoise& noise,

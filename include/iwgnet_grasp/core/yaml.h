@@ -26,6 +26,7 @@ class YamlFile {
   bool has(const std::string& key) const;
   YAML::Node node(const std::string& key) const;  // Throws Error when absent.
   Eigen::VectorXd vector(const std::string& key, int size) const;
+  Pose pose(const std::string& key) const;  // {rotation: 3 rows of 3, translation: 3}
   [[noreturn]] void fail(const std::string& key, const std::string& what) const;
   const YAML::Node& root() const { return root_; }
 

@@ -14,7 +14,7 @@
 
 namespace iwgnet_grasp::motion {
 
-// Part in the gripper, as a capsule in the TCP frame of the present gap.
+// Part in the gripper, or a piece of it, as a capsule in the TCP frame of the present gap.
 struct AttachedPart {
   Eigen::Vector3d a, b;  // m
   double radius;         // m
@@ -41,6 +41,7 @@ class CollisionWorld {
   // Places the fingers. Default: wide open.
   void set_gripper_gap(double gap);
   void set_attached(const std::optional<AttachedPart>& part);
+  void set_attached(const std::vector<AttachedPart>& pieces);
   // Within these columns (3 mm about x, y of tool0 in base_link) a gripper that points down moves
   // straight onto or off a part: there its fingers and the held part are not checked against the
   // heights, which the grasp pose has cleared already, nor the held part against anything.
@@ -53,7 +54,7 @@ class CollisionWorld {
   std::vector<Sphere> spheres(const JointVector& q) const;
 
  private:
-  static constexpr int kCapacity = 112;  // spheres
+  static constexpr int kCapacity = 160;  // spheres
 
   struct LocalSphere {
     Body body;
@@ -92,7 +93,7 @@ class CollisionWorld {
   std::vector<Obstacle> obstacles_;
   Heights heights_;
   double gap_;
-  std::optional<AttachedPart> attached_;
+  std::vector<AttachedPart> attached_;
   std::vector<Eigen::Vector2d> columns_;
   std::vector<LocalSphere> spheres_;  // in the order of Body
   std::array<BodySpheres, kBodies> bodies_;

@@ -55,8 +55,21 @@ class SimulatedCell {
   // drawn where it is, the physics keeps them where config() says.
   const CameraConfig& camera() const;
   void set_camera(const CameraConfig& camera);
+  // From now on, in every scene, the camera hangs where hands have mounted it: off its nominal pose
+  // by what the seed draws from config/calibration.yaml.
+  void offset_camera(std::uint64_t seed);
+
+  // Bolts the calibration rig to the gripper, from the next scene on: a plate with this print (see
+  // Renderer::add_sheet), off its nominal pose by what the seed draws. Scenes then begin with the
+  // arm at the rig's start_joints. The plate is drawn; it has no mass and no contacts.
+  void hold_board(const cv::Mat& print, std::uint64_t seed);
+  bool has_board() const;
+  // Pose of the board in the colour camera with the noise of simulated target poses; each index is
+  // a draw of its own. Throws Error without a board.
+  Pose measure_board(std::uint64_t index) const;
 
   // Ground truth: for the judge, for labels and for pictures only.
+  Pose T_tool_board() const;              // Throws Error without a board.
   World& world();
   sensing::Renderer& renderer();          // poses brought up to date by sync_renderer()
   void sync_renderer();

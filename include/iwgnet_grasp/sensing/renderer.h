@@ -34,6 +34,9 @@ class Renderer {
   // A mesh is built once; instances place it. Handles are stable until clear_instances().
   int add_mesh(const TriangleMesh& mesh);
   int add_box(const Eigen::Vector3d& size);  // centred at its origin
+  // A printed sheet: size (m) about the origin of its xy plane, seen from +z. print: CV_8UC1,
+  // albedo in 1/255, first row at +y. A pixel sees the mean of what it covers.
+  int add_sheet(const Eigen::Vector2d& size, const cv::Mat& print);
   int add_instance(int mesh, const Material& material, const Pose& T_base_instance);
   void set_pose(int instance, const Pose& T_base_instance);
   void set_material(int instance, const Material& material);
