@@ -4,8 +4,10 @@ Torch is imported by the commands that need it, so that help and refusals come a
 """
 
 import logging
+import shlex
+import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -134,20 +136,71 @@ def train_detector(context: typer.Context) -> None:
 @app.command("evaluate")
 def evaluate(
     weights: Annotated[
-        list[str], typer.Option(help="Name in models/ or path; give it again for more.")
-    ] = ["iwgnet"],  # noqa: B006
-    data: Annotated[Path, typer.Option(help="Held-out folder.")] = Path("data/val"),
-    backend: Annotated[str, typer.Option(help="auto, openvino or torch.")] = "auto",
-    limit: Annotated[int, typer.Option(min=0, help="Use the first N samples; 0: all.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Also write this file.")] = None,
+        list[str] | None,
+        typer.Option(
+            help="Name in models/ or path; give it again for more. Default: all grasp networks "
+            "in models/."
+        ),
+    ] = None,
+    data: Annotated[
+        list[Path], typer.Option(help="Held-out folder in any layout; give it again for more.")
+    ] = [Path("data/val")],  # noqa: B006
+    backend: Annotated[str, typer.Option(help="auto: the fastest that agrees.")] = "auto",
+    limit: Annotated[int, typer.Option(min=0, help="First N samples of a set; 0: all.")] = 0,
+    lifts: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Objects of each set whose first grasp is carried out in Bullet (about 0.5 s a "
+            "lift and network); 0: none.",
+        ),
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Chooses the objects that are lifted.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that lift; 0: one a core.")] = 0,
+    address: Annotated[
+        str | None, typer.Option(help="Of a Ray cluster that lifts, instead of this machine.")
+    ] = None,
+    detector: Annotated[
+        str, typer.Option(help="Weights of the detector: name in models/ or path; '': none.")
+    ] = "yolov5s",
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for evaluation.json, evaluation.md, plots and lifts.jsonl."),
+    ] = Path("results/evaluation"),
+    publish: Annotated[
+        bool, typer.Option(help="Also write docs/results.md and its pictures.")
+    ] = False,
 ) -> None:
-    """Rectangle metric, errors and latency of trained grasp networks, as a Markdown table."""
-    from iwgnet_grasp.training import evaluation
+    """Compare trained networks on held-out data: rectangle metric, lifts, calibration, latency.
 
-    rows = [evaluation.evaluate(name, data, backend, limit) for name in weights]
-    typer.echo(evaluation.as_markdown(rows), nl=False)
-    if json_file:
-        evaluation.write_json(json_file, data, rows)
+    A run that was stopped goes on with the lifts it has. Example: iwgnet evaluate --data data/val
+    --data data/test_rods
+    """
+    from iwgnet_grasp.networks.weights import weights_path
+    from iwgnet_grasp.report.learning import write_report
+    from iwgnet_grasp.training.comparison import compare_networks
+    from iwgnet_grasp.training.evaluation import trained_networks
+
+    comparison = compare_networks(
+        weights or trained_networks(),
+        data,
+        out,
+        backend=backend,
+        limit=limit,
+        lifts=lifts,
+        seed=seed,
+        workers=workers,
+        address=address,
+        detector=weights_path(detector) if detector else None,
+    )
+    for path in write_report(comparison, out, command_line(sys.argv[1:]), publish):
+        typer.echo(f"wrote {path}", err=True)
+    typer.echo((out / "evaluation.md").read_text(), nl=False)
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """The command as it can be typed again."""
+    return shlex.join(["scripts/iwgnet", *arguments])
 
 
 @app.command("dataset", context_settings=_FORWARD)
@@ -156,6 +209,14 @@ def dataset(context: typer.Context) -> None:
     from iwgnet_grasp.data import generate
 
     _forward(context, generate.generate, "dataset")
+
+
+@app.command("calibrate", context_settings=_FORWARD)
+def calibrate(context: typer.Context) -> None:
+    """Solve a camera calibration again from its file; options: iwgnet calibrate --help."""
+    from iwgnet_grasp.calibration import offline
+
+    _forward(context, offline.calibrate, "calibrate")
 
 
 def main() -> None:

@@ -154,17 +154,3 @@ def test_bad_requests_are_one_line(tmp_path):
         train(data, tmp_path, resume=True)
     with pytest.raises(DataError, match="no such folder"):
         train(tmp_path / "absent", tmp_path)
-
-
-def test_evaluation_counts_what_a_network_gets_right(tmp_path):
-    from iwgnet_grasp.training.evaluation import as_markdown, evaluate, write_json
-
-    data = bar_set(tmp_path / "data", 12)
-    weights = train(data, tmp_path, epochs=1)
-    row = evaluate(weights, data, backend="torch")
-    assert row.samples == 12 and row.parameters < 600_000
-    assert 0 <= row.top1 <= row.top5 <= 1 and row.top1 == row.top1_good  # all labels are good
-    assert "| iwgnet |" in as_markdown([row])
-    write_json(tmp_path / "results" / "evaluation.json", data, [row])
-    stored = json.loads((tmp_path / "results" / "evaluation.json").read_text())
-    assert stored["evaluations"][0]["top1"] == row.top1

@@ -21,19 +21,27 @@ IOU_THRESHOLD = 0.25
 ANGLE_THRESHOLD = np.radians(30)
 
 
-def matches(grasp: Grasp, truth: np.ndarray) -> bool:
-    """True when IoU > 0.25 and angle within 30 deg hold for one of the rectangles [n, 6].
+def hit(grasp: Grasp, truth: np.ndarray) -> np.ndarray | None:
+    """Of the rectangles [n, 6] that the grasp matches, the one with the nearest centre, [6].
 
-    The jaw is the gripper's and not predicted: it is taken from the rectangle compared with.
+    It matches where IoU > 0.25 and the angles are within 30 deg. The jaw is the gripper's and not
+    predicted: it is taken from the rectangle compared with.
     """
     row = np.empty(COLUMNS, np.float32)
     row[[X, Y, THETA]] = grasp.x_px, grasp.y_px, grasp.theta_rad
     row[[OPENING, QUALITY]] = grasp.width_px, grasp.quality
-    for candidate in truth[angle_between(truth[:, THETA], row[THETA]) <= ANGLE_THRESHOLD]:
-        row[JAW] = candidate[JAW]
-        if iou(row, candidate) > IOU_THRESHOLD:
-            return True
-    return False
+    distances = np.hypot(truth[:, X] - row[X], truth[:, Y] - row[Y])
+    turned = angle_between(truth[:, THETA], row[THETA]) > ANGLE_THRESHOLD
+    for i in np.argsort(distances, kind="stable"):
+        row[JAW] = truth[i, JAW]
+        if not turned[i] and iou(row, truth[i]) > IOU_THRESHOLD:
+            return truth[i]
+    return None
+
+
+def matches(grasp: Grasp, truth: np.ndarray) -> bool:
+    """Whether the grasp hits one of the rectangles [n, 6]."""
+    return hit(grasp, truth) is not None
 
 
 def any_match(grasps: Iterable[Grasp], truth: np.ndarray) -> bool:

@@ -117,7 +117,9 @@ def lift_all(
     kind = SceneKind(tuple(families), settings, library, detector=False)
     pool = open_pool(kind, workers, address, PACKAGE)
     try:
+        whole = not kept.is_file() or kept.read_text().endswith("\n")
         with kept.open("a") as file:
+            file.write("" if whole else "\n")  # after the line of a killed run
             running = {
                 pool.submit("network_lifts", seed, pile, wanted): wanted
                 for pile, wanted in sorted(piles.items())
@@ -228,8 +230,9 @@ def _read(path: Path) -> dict[str, dict]:
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:
             entry = json.loads(line)
-            outcomes[entry.pop("key")] = {k: v for k, v in entry.items() if k != "object"}
-        except (ValueError, KeyError, AttributeError):
+            del entry["object"]
+            outcomes.setdefault(entry.pop("key"), entry)
+        except (ValueError, KeyError, TypeError):
             continue
     return outcomes
 
