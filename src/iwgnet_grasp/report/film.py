@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -69,20 +69,20 @@ def looking_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def write_gif(
-    path: Path,
+    file: Path | BinaryIO,
     frames: Sequence[Frame],
     captions: Sequence[str],
     frame_ms: int = 70,
     hold_ms: int = 2000,
     colors: int = 64,
-) -> Path:
+) -> None:
     """An endless GIF of the frames, each over its caption; the last one stays for hold_ms.
 
     One palette for all and no dithering, so that what stands still costs nothing. Raises
     ValueError without frames, OSError.
     """
     if not frames:
-        raise ValueError(f"{path}: a film of no frames")
+        raise ValueError("a film of no frames")
     images = [
         Image.fromarray(captioned(frame.image, text))
         for frame, text in zip(frames, captions, strict=True)
@@ -95,14 +95,14 @@ def write_gif(
     palette = sheet.quantize(colors, Image.Quantize.MEDIANCUT)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     indexed[0].save(
-        path,
+        file,
+        "GIF",
         save_all=True,
         append_images=indexed[1:],
         duration=[frame_ms] * (len(indexed) - 1) + [hold_ms],
         loop=0,
         optimize=False,
     )
-    return path
 
 
 def captioned(image: np.ndarray, text: str) -> np.ndarray:

@@ -19,13 +19,15 @@ from iwgnet_grasp.trials.batch import (
     Run,
     read_records,
     read_run,
+    read_summary,
     run_trials,
     scene_names,
 )
+from iwgnet_grasp.trials.comparison import compare, named_comparison, read_comparison, sweep
 from iwgnet_grasp.trials.overrides import parse_overrides
 from iwgnet_grasp.trials.pool import PoolError
 from iwgnet_grasp.trials.progress import Progress, trial_line
-from iwgnet_grasp.trials.table import print_table
+from iwgnet_grasp.trials.table import print_comparison, print_table
 from iwgnet_grasp.trials.worker import PACKAGE, Conditions
 
 app = typer.Typer(
@@ -97,7 +99,7 @@ def run(
         _existing(calibration),
         camera_offset,
     )
-    out = out or PACKAGE / "results" / "runs" / f"{time.strftime('%Y%m%d-%H%M%S')}_{scene}"
+    out = out or _new_folder(scene)
     with Progress() as progress:
         summary = checked_run(
             Run(scenes, trials, seed, conditions), out, workers, address, progress
@@ -157,6 +159,105 @@ def replay_command(
     typer.echo(f"wrote {', '.join(str(path) for path in paths)} and the pictures of each look")
 
 
+@app.command("compare")
+def compare_command(
+    name: Annotated[
+        str | None, typer.Argument(help="Of config/comparisons.yaml, such as priority.")
+    ] = None,
+    axes: Annotated[
+        list[str], typer.Option("--sweep", help="FILE.KEY=V1,V2,...; two give every combination.")
+    ] = [],  # noqa: B006
+    scene: SceneOption = "ten_stacked",
+    trials: TrialsOption = 20,
+    seed: SeedOption = 200,
+    replan: ReplanOption = Replan.every,
+    transport: TransportOption = Transport.inprocess,
+    workers: WorkersOption = 1,
+    address: AddressOption = None,
+    changes: SetOption = [],  # noqa: B006
+    calibration: CalibrationOption = None,
+    camera_offset: CameraOffsetOption = -1,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; one that holds this comparison is gone on with.")
+    ] = None,
+) -> None:
+    """Runs variants of the settings on the same seeds: a named comparison, or a sweep.
+
+    Examples: scripts/run_trials compare priority --trials 30
+
+    scripts/run_trials compare --sweep priority.beta=0,0.5,1,2,4 --scene seven_stacked,ten_stacked
+    """
+    if (name is None) == (not axes):
+        raise BatchError("compare: give a comparison's name, or --sweep FILE.KEY=V1,V2,...")
+    comparison = named_comparison(name) if name else sweep(axes)
+    conditions = Conditions(
+        replan.value,
+        transport.value,
+        parse_overrides(changes),
+        _existing(calibration),
+        camera_offset,
+    )
+    base = Run(chosen_scenes(scene), trials, seed, conditions)
+    out = out or _new_folder(f"compare_{comparison.name}")
+    with Progress() as progress:
+        result = compare(
+            comparison,
+            base,
+            out,
+            lambda run, folder, title: checked_run(run, folder, workers, address, progress, title),
+        )
+    print_comparison(result)
+    typer.echo(f"trials, summaries and comparison in {out}")
+
+
+@app.command("report")
+def report_command(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, the headline first.")],
+    comparisons: Annotated[
+        list[Path], typer.Option("--compare", help="Folder of a comparison; again for more.")
+    ] = [],  # noqa: B006
+    page: Annotated[Path, typer.Option("--html", help="The page to write.")] = PACKAGE
+    / "results"
+    / "trials.html",
+    docs: Annotated[bool, typer.Option(help="Write docs/results.md, too.")] = True,
+    examples: Annotated[
+        bool, typer.Option(help="Replay the first run's first trial of each scene, with a film.")
+    ] = True,
+) -> None:
+    """Writes the page and docs/results.md of finished runs and comparisons.
+
+    Example: scripts/run_trials report RUN_EVERY RUN_ONCE --compare PRIORITY --compare NETWORKS
+    """
+    from iwgnet_grasp.report.trial_report import Report, write_docs, write_page
+    from iwgnet_grasp.trials.replay import replay
+
+    summaries = {}
+    for folder in runs:
+        summary = read_summary(folder)
+        title = (
+            "One look, one sequence"
+            if summary["run"]["replan"] == "once"
+            else ("A look after each pick")
+        )
+        if summary["run"]["transport"] == "ros":
+            title += ", over ROS"
+        if title in summaries:
+            title += f" ({folder.name})"
+        summaries[title] = summary
+    compared = [read_comparison(folder) for folder in comparisons]
+    shown = []
+    if examples:
+        run = read_run(runs[0])
+        conditions = replace(run.conditions, transport="inprocess")
+        for scene in run.scenes:
+            typer.echo(f"replaying {scene} seed {run.first_seed}", err=True)
+            shown.append(replay(conditions, scene, run.first_seed))
+    report = Report(summaries, compared, shown)
+    typer.echo(f"wrote {write_page(report, page)}")
+    if docs:
+        typer.echo(f"wrote the sections {', '.join(write_docs(report))} of docs/results.md")
+
+
 def checked_run(
     run: Run, out: Path, workers: int, address: str | None, progress: Progress, name: str = ""
 ) -> dict:
@@ -185,6 +286,10 @@ def chosen_scenes(text: str) -> tuple[str, ...]:
         if name not in known:
             raise BatchError(f"--scene: '{name}' is not one of all, {', '.join(known)}")
     return tuple(dict.fromkeys(names))
+
+
+def _new_folder(name: str) -> Path:
+    return PACKAGE / "results" / "runs" / f"{time.strftime('%Y%m%d-%H%M%S')}_{name}"
 
 
 def _existing(path: Path | None) -> str:

@@ -75,7 +75,8 @@ def write_replay(result: Replay, out: Path, frames: bool = False) -> list[Path]:
     pictures.finish()
     paths = [write_png(out / "strip.png", trial_strip(result.record, result.plans, result.frames))]
     if result.frames:
-        paths.append(write_gif(out / "film.gif", result.frames, result.captions()))
+        paths.append(out / "film.gif")
+        write_gif(paths[-1], result.frames, result.captions())
     if frames:
         folder = out / "frames"
         folder.mkdir(exist_ok=True)

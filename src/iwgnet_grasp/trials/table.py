@@ -63,8 +63,39 @@ def cause_rows(summary: dict) -> tuple[list[str], Rows]:
     return head, rows
 
 
+def comparison_rows(comparison: dict) -> tuple[list[str], Rows]:
+    """Head and rows: a variant and scene a row."""
+    head = ["variant", "scene", "success", "rate", "95 % interval", "GSR", "cleared", "picks/h"]
+    rows = []
+    for variant in comparison["variants"]:
+        for scene, s in variant["summary"]["scenes"].items():
+            rows.append(
+                [
+                    variant["name"],
+                    scene.replace("_", " "),
+                    f"{s['successes']}/{s['trials']}",
+                    percent(s["success_rate"]),
+                    interval(s["interval_95"]),
+                    percent(s["gsr"]),
+                    percent(s["cleared"]),
+                    number(s["picks_per_hour"]),
+                ]
+            )
+    return head, rows
+
+
+def print_comparison(comparison: dict) -> None:
+    head, rows = comparison_rows(comparison)
+    table = Table(title=comparison["title"], box=None, padding=(0, 2, 0, 0), header_style="")
+    for i, name in enumerate(head):
+        table.add_column(name, justify="left" if i < 2 else "right")
+    for row in rows:
+        table.add_row(*row)
+    _console().print(table)
+
+
 def print_table(summary: dict) -> None:
-    console = Console(highlight=False)
+    console = _console()
     for head, rows in (success_rows(summary), cause_rows(summary)):
         # A column a figure does not fit 80 columns: the figures stand below each other.
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=True, header_style="")
@@ -89,6 +120,13 @@ def markdown(head: list[str], rows: Rows) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def _console() -> Console:
+    console = Console(highlight=False)
+    if not console.is_terminal:  # a file has no edge to break lines at
+        console.width = 200
+    return console
+
+
 def percent(share: float | None) -> str:
     return "" if share is None else f"{100 * share:.1f} %".replace("100.0", "100")
 
@@ -97,12 +135,13 @@ def interval(bounds: list[float]) -> str:
     return f"{100 * bounds[0]:.0f}-{100 * bounds[1]:.0f} %"
 
 
+def number(value: float | None, digits: int = 0) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
 def _speed_and_care(s: dict) -> list[str]:
     def spread(value: dict | None) -> str:
         return f"{value['median']:.1f} / {value['max']:.1f}" if value else ""
-
-    def number(value: float | None, digits: int = 0) -> str:
-        return "" if value is None else f"{value:.{digits}f}"
 
     trials = max(s["trials"], 1)
     return [
