@@ -113,7 +113,8 @@ def test_suppression_keeps_the_best_of_overlapping_boxes_of_a_class():
     kept, score, label = non_maximum_suppression(boxes, scores, 0.25, 0.5, 10)
     assert score.tolist() == pytest.approx([0.9, 0.7, 0.6])
     assert label.tolist() == [0, 1, 0]
-    assert kept[0].tolist() == [1, 0, 11, 10]
+    # IoU 9/11 with the first box: one object, whose box is their mean weighted by 0.9 and 0.8.
+    assert kept[0].tolist() == pytest.approx([0.9 / 1.7, 0, 10 + 0.9 / 1.7, 10])
     assert len(non_maximum_suppression(boxes, scores, 0.25, 0.5, 2)[0]) == 2
 
 
@@ -142,6 +143,18 @@ def test_assignment_stays_inside_the_grid():
     target = torch.tensor([[0, 0, 0.5, 0.5, 16.0, 16.0], [0, 0, 159.9, 159.9, 16.0, 16.0]])
     match = assign(target, anchors, 8, (20, 20), 4.0)
     assert cells(match, 0) == {(0, 0), (19, 19)}
+
+
+def test_crossing_boxes_with_one_centre_each_get_the_anchor_of_their_shape():
+    anchors = torch.tensor([[20.0, 40.0], [40.0, 20.0], [30.0, 30.0]])
+    standing = [0, 0, 84.0, 84.0, 20.0, 41.0]
+    lying = [0, 1, 84.0, 84.0, 44.0, 20.0]
+    match = assign(torch.tensor([standing, lying]), anchors, 8, (20, 20), 4.0)
+    places = torch.stack([match.image, match.anchor, match.row, match.column], 1)
+    assert len(places.unique(dim=0)) == len(places)
+    assert set(match.label[match.anchor == 0].tolist()) == {0}
+    assert set(match.label[match.anchor == 1].tolist()) == {1}
+    assert set(match.label[match.anchor == 2].tolist()) == {0}  # 41/30 is nearer than 44/30
 
 
 def test_a_perfect_prediction_has_almost_no_loss():

@@ -7,50 +7,16 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from pycocotools import mask as coco_mask
 from torch.utils.data import Dataset
 
 from iwgnet_grasp.data.errors import DataError
-
-BORDER = 114  # grey around a letterboxed image
-
-
-@dataclass(frozen=True)
-class Letterbox:
-    """How an image was fitted into the network's input: input px = scale * image px + offset."""
-
-    scale: float
-    left: float
-    top: float
-
-    def to_image(self, boxes: np.ndarray) -> np.ndarray:
-        """Corner boxes (N, 4) in input px -> image px."""
-        offset = np.array([self.left, self.top] * 2)
-        return (boxes - offset) / self.scale
-
-    def to_input(self, boxes: np.ndarray) -> np.ndarray:
-        """Corner boxes (N, 4) in image px -> input px."""
-        return boxes * self.scale + np.array([self.left, self.top] * 2)
-
-
-def letterbox(image: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, Letterbox]:
-    """The whole image in (rows, columns), its aspect ratio kept, the rest grey.
-
-    Pixels here count from the image's corner: a box's edge lies on the border of two pixels.
-    """
-    rows, columns = image.shape[:2]
-    scale = min(size[0] / rows, size[1] / columns)
-    height, width = min(round(rows * scale), size[0]), min(round(columns * scale), size[1])
-    top, left = (size[0] - height) // 2, (size[1] - width) // 2
-    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    fitted = np.full((*size, 3), BORDER, np.uint8)
-    fitted[top : top + height, left : left + width] = cv2.resize(
-        image, (width, height), interpolation=method
-    )
-    return fitted, Letterbox(scale, left, top)
+from iwgnet_grasp.data.letterbox import BORDER, WHOLE, Region, letterbox
 
 
 @dataclass(frozen=True)
@@ -61,6 +27,10 @@ class DetectionScene:
     image: np.ndarray  # (rows, columns, 3) uint8 RGB
     boxes: np.ndarray  # (N, 4) float32 corners x1, y1, x2, y2 in px of `image`
     labels: np.ndarray  # (N,) int64 index into the set's classes
+    # N outlines (K, 2) float32 x, y px of what is seen of each object, less than a pixel between
+    # two points; none where the set has no masks.
+    outlines: tuple[np.ndarray, ...] = ()
+    arrangement: str = ""  # of the parts, where the set says it
 
 
 @dataclass(frozen=True)
@@ -82,13 +52,17 @@ class DetectionSet:
 
 
 def load_detection_set(
-    folder: str | Path, size: tuple[int, int], limit: int | None = None, workers: int = 2
+    folder: str | Path,
+    size: tuple[int, int],
+    limit: int | None = None,
+    workers: int = 2,
+    region: Region = WHOLE,
 ) -> DetectionSet:
-    """Reads FOLDER/detector/{annotations.json, images/*.png}; images letterboxed to `size`.
+    """Reads FOLDER/detector/{annotations.json, images/*.png}; the images' region fitted to `size`.
 
     folder: a data set made by 'iwgnet dataset' (or its detector folder). limit: at most that many
-    scenes. Boxes of COCO [x, y, width, height]; crowd regions are left out. Classes are ordered by
-    category id. Raises DataError.
+    scenes. Boxes of COCO [x, y, width, height], masks polygons or run-length codes; crowd regions
+    are left out. Classes are ordered by category id. Raises DataError.
     """
     root = Path(folder)
     root = root / "detector" if (root / "detector").is_dir() else root
@@ -97,15 +71,22 @@ def load_detection_set(
         text = json.loads(path.read_text())
         categories = sorted(text["categories"], key=lambda c: c["id"])
         index = {c["id"]: i for i, c in enumerate(categories)}
-        boxes: dict[int, list[tuple[list[float], int]]] = {i["id"]: [] for i in text["images"]}
+        objects: dict[int, list[_Object]] = {i["id"]: [] for i in text["images"]}
         for annotation in text["annotations"]:
             if not annotation.get("iscrowd", 0):
                 x, y, w, h = (float(v) for v in annotation["bbox"])
-                boxes[annotation["image_id"]].append(
-                    ([x, y, x + w, y + h], index[annotation["category_id"]])
+                objects[annotation["image_id"]].append(
+                    _Object(
+                        (x, y, x + w, y + h),
+                        index[annotation["category_id"]],
+                        annotation.get("segmentation"),
+                    )
                 )
         images = sorted(text["images"], key=lambda i: i["file_name"])[:limit]
-        files = [(i["id"], root / "images" / Path(i["file_name"]).name) for i in images]
+        files = [
+            (i["id"], root / "images" / Path(i["file_name"]).name, str(i.get("arrangement", "")))
+            for i in images
+        ]
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; make data with 'iwgnet dataset'") from None
     except (OSError, KeyError, TypeError, ValueError) as error:
@@ -114,15 +95,31 @@ def load_detection_set(
     if not files or not categories:
         raise DataError(f"{path}: names no images or no categories")
 
-    def read(entry: tuple[int, Path]) -> DetectionScene:
-        identifier, file = entry
+    def read(entry: tuple[int, Path, str]) -> DetectionScene:
+        identifier, file, arrangement = entry
         image = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if image is None:
             raise DataError(f"{file}: missing or not an image")
-        fitted, fit = letterbox(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), size)
-        corners = np.array([b for b, _ in boxes[identifier]], np.float64).reshape(-1, 4)
-        labels = np.array([label for _, label in boxes[identifier]], np.int64)
-        return DetectionScene(file.stem, fitted, fit.to_input(corners).astype(np.float32), labels)
+        fitted, fit = letterbox(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), size, region)
+        found = objects[identifier]
+        corners = np.array([o.corners for o in found], np.float64).reshape(-1, 4)
+        outlines = ()
+        if all(o.segmentation for o in found):
+            try:
+                points = [outline(o.segmentation, image.shape[:2]) for o in found]
+            except (KeyError, TypeError, ValueError) as error:
+                raise DataError(f"{path}: a mask of {file.name} cannot be read ({error})") from None
+            outlines = tuple(
+                fit.to_input(np.hstack([p, p]))[:, :2].astype(np.float32) for p in points
+            )
+        return DetectionScene(
+            file.stem,
+            fitted,
+            fit.to_input(corners).astype(np.float32),
+            np.array([o.label for o in found], np.int64),
+            outlines,
+            arrangement,
+        )
 
     with ThreadPoolExecutor(workers) as pool:
         scenes = tuple(pool.map(read, files))
@@ -130,15 +127,52 @@ def load_detection_set(
 
 
 @dataclass(frozen=True)
+class _Object:
+    """A COCO annotation: corners x1, y1, x2, y2 px, class index, mask or None."""
+
+    corners: tuple[float, float, float, float]
+    label: int
+    segmentation: Any
+
+
+def outline(segmentation: Any, shape: tuple[int, int]) -> np.ndarray:
+    """(K, 2) x, y: the corners of the pixels around a COCO mask in an image of (rows, columns)."""
+    if isinstance(segmentation, list):
+        segmentation = coco_mask.merge(coco_mask.frPyObjects(segmentation, *shape))
+    elif isinstance(segmentation["counts"], list):
+        segmentation = coco_mask.frPyObjects(segmentation, *shape)
+    contours, _ = cv2.findContours(
+        coco_mask.decode(segmentation), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    pixels = np.concatenate([c[:, 0] for c in contours])
+    corners = pixels[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+    return np.unique(corners.reshape(-1, 2), axis=0)
+
+
+def box_outline(box: np.ndarray) -> np.ndarray:
+    """(K, 2) points along the edges of a corner box, at most a pixel apart."""
+    x1, y1, x2, y2 = box
+    x, y = np.linspace(x1, x2, int(x2 - x1) + 2), np.linspace(y1, y2, int(y2 - y1) + 2)
+    return np.vstack(
+        [
+            np.column_stack(np.broadcast_arrays(*side))
+            for side in ((x, y1), (x, y2), (x1, y), (x2, y))
+        ]
+    )
+
+
+@dataclass(frozen=True)
 class Augmentation:
     """Random change of a training image. The camera looks down, so every turn is a valid view."""
 
-    scale: float = 1.25  # zoom between 1/scale and scale
+    scale: float = 1.15  # zoom between 1/scale and scale
+    any_turn: float = 0.5  # share of the windows turned by any angle, where there are masks; the
+    # others turn by quarters
     brightness: float = 0.35  # gain of the value channel, +-
     saturation: float = 0.5
     hue: float = 0.02  # of a full turn, +-
     noise: float = 6.0  # greatest standard deviation of pixel noise, grey levels
-    min_visible: float = 0.25  # least part of a box inside the window for it to count
+    min_visible: float = 0.25  # least part of an outline inside the window for it to count
 
 
 class DetectionWindows(Dataset):
@@ -164,14 +198,22 @@ class DetectionWindows(Dataset):
         self.zoom = zoom
         self.seed = (seed, epoch)
         self.augmentation = augmentation or Augmentation()
+        # Full tables are looked at more often: one entry an object.
+        self.objects = [(i, k) for i, scene in enumerate(scenes) for k in range(len(scene.boxes))]
 
     def __len__(self) -> int:
         return self.count
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         rng = np.random.default_rng((*self.seed, index))
-        scene = self.scenes[rng.integers(len(self.scenes))]
-        matrix = self._view(scene, rng)
+        if self.objects and rng.random() < 0.9:
+            i, k = self.objects[rng.integers(len(self.objects))]
+            scene = self.scenes[i]
+            looked_at = (scene.boxes[k, :2] + scene.boxes[k, 2:]) / 2
+        else:
+            scene = self.scenes[rng.integers(len(self.scenes))]
+            looked_at = rng.uniform((0, 0), scene.image.shape[1::-1])
+        matrix = self._view(scene, looked_at, rng)
         rows, columns = self.size
         # Boxes count from the corner of a pixel, warpAffine from its middle.
         half = matrix[:, :2].sum(1, keepdims=True) / 2 - 0.5
@@ -188,21 +230,20 @@ class DetectionWindows(Dataset):
         pixels = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
         return pixels, torch.from_numpy(boxes), torch.from_numpy(labels)
 
-    def _view(self, scene: DetectionScene, rng: np.random.Generator) -> np.ndarray:
-        """(2, 3) affine: scene px -> window px. A quarter turn, a flip, a zoom, a place."""
+    def _view(
+        self, scene: DetectionScene, looked_at: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """(2, 3) affine: scene px -> window px. A turn, a flip, a zoom, a place."""
         rows, columns = self.size
         zoom = self.zoom * self.augmentation.scale ** rng.uniform(-1, 1)
         turn = rng.integers(4) * np.pi / 2
+        if rng.random() < self.augmentation.any_turn and scene.outlines:
+            turn = rng.uniform(0, 2 * np.pi)
         linear = zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         if rng.random() < 0.5:
             linear[0] *= -1
         linear[np.abs(linear) < 1e-9] = 0.0
         scene_rows, scene_columns = scene.image.shape[:2]
-        if len(scene.boxes) and rng.random() < 0.85:
-            box = scene.boxes[rng.integers(len(scene.boxes))]
-            looked_at = (box[:2] + box[2:]) / 2
-        else:
-            looked_at = rng.uniform((0, 0), (scene_columns, scene_rows))
         # The point looked at may appear anywhere but near the edge, where its object is cut.
         place = np.array([columns, rows]) * rng.uniform(0.25, 0.75, 2)
         if rows >= scene_rows * zoom and columns >= scene_columns * zoom:
@@ -211,16 +252,20 @@ class DetectionWindows(Dataset):
         return np.hstack([linear, (place - linear @ looked_at)[:, None]])
 
     def _boxes(self, scene: DetectionScene, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of what the window shows of each object: a cut object's box ends where it is cut."""
         rows, columns = self.size
-        corners = scene.boxes.reshape(-1, 2, 2) @ matrix[:, :2].T + matrix[:, 2]
-        low, high = corners.min(1), corners.max(1)
-        limit = np.array([columns, rows])
-        inside = np.hstack([np.clip(low, 0, limit), np.clip(high, 0, limit)])
-        visible = np.prod(inside[:, 2:] - inside[:, :2], 1) / np.prod(high - low, 1).clip(1e-6)
-        kept = (visible >= self.augmentation.min_visible) & (
-            (inside[:, 2:] - inside[:, :2]).min(1, initial=np.inf) > 2
-        )
-        return inside[kept].astype(np.float32), scene.labels[kept]
+        boxes, labels = [], []
+        outlines = scene.outlines or [box_outline(box) for box in scene.boxes]
+        for points, label in zip(outlines, scene.labels, strict=True):
+            points = points @ matrix[:, :2].T + matrix[:, 2]
+            inside = points[((points >= 0) & (points <= (columns, rows))).all(1)]
+            if len(inside) < max(self.augmentation.min_visible * len(points), 1):
+                continue
+            low, high = inside.min(0), inside.max(0)
+            if (high - low).min() > 2:
+                boxes.append([*low, *high])
+                labels.append(label)
+        return np.array(boxes, np.float32).reshape(-1, 4), np.array(labels, np.int64)
 
 
 def recolour(image: np.ndarray, change: Augmentation, rng: np.random.Generator) -> np.ndarray:

@@ -21,6 +21,7 @@ ANCHORS = (
     ((30, 61), (62, 45), (59, 119)),
     ((116, 90), (156, 198), (373, 326)),
 )
+SAME_BOX_IOU = 0.8  # boxes of one object that overlap more are averaged
 
 
 class ConvBlock(nn.Module):
@@ -195,13 +196,16 @@ def non_maximum_suppression(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Greedy suppression within each class on one image's boxes (N, 4) and scores (N, classes).
 
-    Returns boxes (K, 4), scores (K,) and classes (K,), K <= max_objects, by descending score.
+    Returns boxes (K, 4), scores (K,) and classes (K,), K <= max_objects, by descending score. A
+    box is the mean, weighted by the scores, of all that agree with the best to SAME_BOX_IOU: the
+    errors of neighbouring cells and anchors are partly independent.
     """
     score, label = scores.max(-1)
     chosen = torch.nonzero(score > score_threshold).squeeze(1)
     chosen = chosen[score[chosen].argsort(descending=True, stable=True)][:1000]
     boxes, score, label = boxes[chosen], score[chosen], label[chosen]
-    rival = (box_iou(boxes, boxes) > iou_threshold) & (label[:, None] == label[None])
+    overlap = box_iou(boxes, boxes) * (label[:, None] == label[None])
+    rival = overlap > iou_threshold
     alive = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     kept: list[int] = []
     for i in range(len(boxes)):
@@ -210,7 +214,9 @@ def non_maximum_suppression(
             alive &= ~rival[i]
             if len(kept) == max_objects:
                 break
-    return boxes[kept], score[kept], label[kept]
+    weight = (overlap[kept] > SAME_BOX_IOU) * score
+    mean = weight @ boxes / weight.sum(1, keepdim=True)
+    return mean, score[kept], label[kept]
 
 
 def _twice(x: Tensor) -> Tensor:

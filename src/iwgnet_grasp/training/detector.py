@@ -8,7 +8,7 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,19 +23,23 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from iwgnet_grasp.data.detection import (
+    DetectionScene,
     DetectionSet,
     DetectionWindows,
     WholeScenes,
     collate,
     load_detection_set,
 )
-from iwgnet_grasp.networks.weights import load_state, save_weights
-from iwgnet_grasp.networks.yolov5s import YOLOv5s, decode, non_maximum_suppression
+from iwgnet_grasp.data.letterbox import WHOLE, Region, checked_region
+from iwgnet_grasp.networks.weights import load_state, read_card, save_weights
+from iwgnet_grasp.networks.yolov5s import ANCHORS, YOLOv5s, decode, non_maximum_suppression
 from iwgnet_grasp.training.detector_loss import LossWeights, detection_loss
 from iwgnet_grasp.training.detector_metrics import ImageBoxes, average_precision
 
 PACKAGE = Path(__file__).resolve().parents[3]
 DEFAULT_CONFIG = PACKAGE / "config" / "detector_training.yaml"
+
+Anchors = tuple[tuple[tuple[float, float], ...], ...]  # (width, height) px, three a scale
 
 
 class DetectorTrainingError(ValueError):
@@ -64,6 +68,8 @@ class DetectorTrainingConfig:
 
     phases: tuple[Phase, ...]
     input: tuple[int, int] = (416, 640)
+    region: Region = WHOLE
+    anchors: Anchors = ANCHORS
     held_out: float = 0.1
     seed: int = 0
     learning_rate: float = 2e-3
@@ -71,6 +77,7 @@ class DetectorTrainingConfig:
     warmup_steps: int = 100
     weight_decay: float = 5e-3
     ema_decay: float = 0.99
+    batch_norm_images: int = 0
     loss: LossWeights = field(default_factory=LossWeights)
 
     @staticmethod
@@ -93,6 +100,8 @@ class DetectorTrainingConfig:
             return DetectorTrainingConfig(
                 phases=phases,
                 input=_size(text["input"]),
+                region=checked_region(text["region"]),
+                anchors=_anchors(text["anchors"]),
                 held_out=float(text["held_out"]),
                 seed=int(text["seed"]),
                 learning_rate=float(text["learning_rate"]),
@@ -100,6 +109,7 @@ class DetectorTrainingConfig:
                 warmup_steps=int(text["warmup_steps"]),
                 weight_decay=float(text["weight_decay"]),
                 ema_decay=float(text["ema_decay"]),
+                batch_norm_images=int(text["batch_norm_images"]),
                 loss=LossWeights(
                     box=float(loss["box"]),
                     objectness=float(loss["objectness"]),
@@ -169,6 +179,7 @@ class DetectorTraining(lightning.LightningModule):
         super().__init__()
         self.config = config
         self.model = YOLOv5s(classes).to(memory_format=torch.channels_last)
+        self.model.anchors.copy_(torch.tensor(config.anchors))
         self.metrics: dict[str, float] = {}
         self._truth: list[ImageBoxes] = []
         self._found: list[ImageBoxes] = []
@@ -218,16 +229,9 @@ class DetectorTraining(lightning.LightningModule):
         self._truth, self._found = [], []
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
-        images, targets = batch
-        boxes, scores = decode(self.model(network_input(images)), self.model.anchors)
-        for i in range(len(images)):
-            best = non_maximum_suppression(boxes[i], scores[i], 0.01, 0.6, 100)
-            self._found.append(ImageBoxes(*(_array(best[k]) for k in (0, 2, 1))))
-            mine = targets[targets[:, 0] == i]
-            low, size = mine[:, 2:4] - mine[:, 4:] / 2, mine[:, 4:]
-            self._truth.append(
-                ImageBoxes(_array(torch.cat((low, low + size), 1)), _array(mine[:, 1].long()))
-            )
+        truth, found = compare(self.model, *batch)
+        self._truth += truth
+        self._found += found
 
     def on_validation_epoch_end(self) -> None:
         self.metrics = average_precision(self._truth, self._found, self.model.classes)
@@ -273,6 +277,7 @@ def fit(
     module = DetectorTraining(config, len(train.classes))
     if initial is not None:
         load_state(module.model, initial, "yolov5s")
+        module.model.anchors.copy_(torch.tensor(config.anchors))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="lightning")
         trainer = lightning.Trainer(
@@ -306,6 +311,60 @@ def fit(
             weights_only=False,
         )
     return module
+
+
+def compare(
+    model: YOLOv5s, images: Tensor, targets: Tensor
+) -> tuple[list[ImageBoxes], list[ImageBoxes]]:
+    """The true boxes and the found ones of a batch from data.detection.collate, in input px."""
+    truth, found = [], []
+    boxes, scores = decode(model(network_input(images)), model.anchors)
+    for i in range(len(images)):
+        best = non_maximum_suppression(boxes[i], scores[i], 0.01, 0.6, 100)
+        found.append(ImageBoxes(*(_array(best[k]) for k in (0, 2, 1))))
+        mine = targets[targets[:, 0] == i]
+        low, size = mine[:, 2:4] - mine[:, 4:] / 2, mine[:, 4:]
+        truth.append(ImageBoxes(_array(torch.cat((low, low + size), 1)), _array(mine[:, 1].long())))
+    return truth, found
+
+
+@torch.no_grad()
+def measure(model: YOLOv5s, scenes: Sequence[DetectionScene]) -> dict[str, Any]:
+    """average_precision's metrics on all scenes, and on those of each arrangement by its name."""
+    device = next(model.parameters()).device
+    model.eval()
+    truth, found = [], []
+    for images, targets in DataLoader(WholeScenes(scenes), batch_size=4, collate_fn=collate):
+        with _autocast(device):
+            real, guess = compare(model, images.to(device), targets.to(device))
+        truth += real
+        found += guess
+    metrics: dict[str, Any] = average_precision(truth, found, model.classes)
+    for kind in sorted({scene.arrangement for scene in scenes} - {""}):
+        chosen = [i for i, scene in enumerate(scenes) if scene.arrangement == kind]
+        metrics[kind] = {"scenes": len(chosen)} | average_precision(
+            [truth[i] for i in chosen], [found[i] for i in chosen], model.classes
+        )
+    return metrics
+
+
+@torch.no_grad()
+def measure_batch_norm(model: YOLOv5s, batches: Iterable[tuple[Tensor, Tensor]]) -> None:
+    """Takes the batch norms' statistics anew, as the mean over `batches`: averaged weights have
+    none of their own, and those of the training lag behind it."""
+    device = next(model.parameters()).device
+    norms = [m for m in model.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    momentum = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # the plain mean
+    model.train()
+    for images, _ in batches:
+        with _autocast(device):
+            model(network_input(images.to(device)))
+    for norm, before in zip(norms, momentum, strict=True):
+        norm.momentum = before
+    model.eval()
 
 
 def save_detector(
@@ -357,11 +416,11 @@ def train_detector(
     if threads is not None:
         torch.set_num_threads(threads)
     start = time.monotonic()
-    train = load_detection_set(data, settings.input, limit)
+    train = load_detection_set(data, settings.input, limit, region=settings.region)
     if validation_data is None:
         train, test = train.split(settings.held_out)
     else:
-        test = load_detection_set(validation_data, settings.input)
+        test = load_detection_set(validation_data, settings.input, region=settings.region)
         if test.classes != train.classes:
             raise DetectorTrainingError(
                 f"{validation_data}: classes {test.classes} differ from the data's {train.classes}"
@@ -385,12 +444,27 @@ def train_detector(
     )
     if not module.trainer.is_global_zero:
         return
+    last = settings.phases[-1]
+    windows = DetectionWindows(
+        train.scenes,
+        settings.batch_norm_images,
+        last.size,
+        last.zoom,
+        settings.seed,
+        settings.epochs,
+    )
+    if settings.batch_norm_images:
+        measure_batch_norm(
+            module.model, DataLoader(windows, batch_size=last.batch, collate_fn=collate)
+        )
+    metrics = measure(module.model, test.scenes)
     path = save_detector(
         module.model,
         output,
         settings.input,
         train.classes,
         {
+            "region": list(settings.region),
             "data": {
                 "set": data.name,
                 "validation_set": validation_data.name if validation_data else None,
@@ -400,16 +474,24 @@ def train_detector(
             },
             "training": {
                 **asdict(settings),
-                "initial": initial and initial.name,
+                "initial": initial and read_card(initial).get("training"),
                 "steps": settings.steps,
                 "images": sum(p.epochs * p.images for p in settings.phases),
                 "minutes": round((time.monotonic() - start) / 60, 1),
                 "torch": torch.__version__,
             },
-            "metrics": {name: round(value, 4) for name, value in module.metrics.items()},
+            "metrics": rounded(metrics),
         },
     )
-    print(f"wrote {path}: mAP50 {module.metrics['map50']:.4f}")
+    print(
+        f"wrote {path}: mAP50 {metrics['map50']:.4f}, mAP50-95 {metrics['map50_95']:.4f}",
+        flush=True,
+    )
+
+
+def rounded(metrics: dict[str, Any]) -> dict[str, Any]:
+    """For a card: four digits are more than the validation set's size allows."""
+    return {k: rounded(v) if isinstance(v, dict) else round(v, 4) for k, v in metrics.items()}
 
 
 def data_seed(folder: Path) -> int | None:
@@ -432,8 +514,19 @@ def has_bfloat16() -> bool:
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
+def _autocast(device: torch.device) -> torch.autocast:
+    return torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16())
+
+
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().cpu().numpy()
+
+
+def _anchors(value: Sequence) -> Anchors:
+    sizes = tuple(tuple((float(w), float(h)) for w, h in scale) for scale in value)
+    if [len(scale) for scale in sizes] != [3, 3, 3] or min(min(a) for s in sizes for a in s) <= 0:
+        raise ValueError("anchors are not three widths and heights a scale")
+    return sizes
 
 
 def _size(value: Sequence[int]) -> tuple[int, int]:

@@ -40,11 +40,13 @@ def assign(
 
     targets: (M, 6) image, class, centre x, y, width, height in px; anchors: (3, 2) px of this
     scale; shape: (rows, columns) of its grid. An anchor takes a box when neither width nor height
-    differs by more than `ratio`, either way.
+    differs by more than `ratio`, either way. Where several boxes want the same anchor of a cell,
+    the one of the most similar size gets it: crossing parts often share their centre, and a cell
+    that learned both would answer with the mean of the two.
     """
     size = targets[:, None, 4:6] / anchors[None]
-    fits = torch.maximum(size, 1 / size).amax(-1) < ratio  # (M, 3)
-    target, anchor = fits.nonzero(as_tuple=True)
+    misfit = torch.maximum(size, 1 / size).amax(-1)  # (M, 3)
+    target, anchor = (misfit < ratio).nonzero(as_tuple=True)
     boxes = targets[target]
     cell = boxes[:, 2:4] / stride  # in cells
     limit = torch.tensor([shape[1], shape[0]], device=cell.device)
@@ -64,12 +66,21 @@ def assign(
     order = where.nonzero()[:, 1]
     column = index[:, 0].clamp(0, shape[1] - 1)
     row = index[:, 1].clamp(0, shape[0] - 1)
+    place = ((targets[target[order], 0].long() * 3 + anchor[order]) * shape[0] + row) * shape[1]
+    place = place + column
+    # By place, then by misfit: the first of a place is the one that fits best.
+    ranking = misfit[target, anchor][order].argsort(stable=True)
+    ranking = ranking[place[ranking].argsort(stable=True)]
+    first = torch.ones(len(ranking), dtype=torch.bool, device=place.device)
+    first[1:] = place[ranking][1:] != place[ranking][:-1]
+    best = ranking[first]
+    order = order[best]
     chosen = boxes[order]
     return Assignment(
         image=chosen[:, 0].long(),
         anchor=anchor[order],
-        row=row,
-        column=column,
+        row=row[best],
+        column=column[best],
         box=chosen[:, 2:6],
         label=chosen[:, 1].long(),
     )
