@@ -2,11 +2,21 @@
 
 import filecmp
 import json
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import cv2
+import imageio.v2 as imageio
 import numpy as np
 import pytest
+import trimesh
 from pycocotools import mask as coco_mask
 from typer.testing import CliRunner
 
@@ -18,25 +28,55 @@ from iwgnet_grasp.data.generate import (
     generate_dataset,
     sole_writer,
 )
-from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, X, Y
+from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_jacquard
+from iwgnet_grasp.data.lift_check import plan_check, summary
+from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
 
-SCENES, SEED = 3, 5
+ROOT = Path(__file__).resolve().parents[2]
+SCENES, SEED = 4, 5  # two piles of three looks, the second cut short
+LIFTS = 4
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("set")
-    scenes, crops = generate_dataset(SCENES, SEED, out, ["connecting_rod"], 1, quiet=True)
+    rods = ["connecting_rod"]
+    scenes, crops = generate_dataset(SCENES, SEED, out, rods, 1, quiet=True, lift_check=LIFTS)
     assert scenes == SCENES and crops > 0
     return out
 
 
 def files(root: Path) -> list[str]:
-    return sorted(
-        str(p.relative_to(root)) for p in root.rglob("*") if p.is_file() and p.name != ".lock"
+    """All files of a set but those that tell of the run."""
+    names = (str(p.relative_to(root)) for p in root.rglob("*") if p.is_file())
+    return sorted(set(names) - {".lock", "lifts.json", "dataset.json"})
+
+
+def command(out: Path, *arguments: str, limit_bytes: int = 0) -> subprocess.Popen:
+    """`iwgnet dataset` of the same set; limit_bytes: the largest file that it may write, the
+    system's stand-in for a full disk."""
+
+    def limit():
+        if limit_bytes:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
+
+    base = ["dataset", "--scenes", str(SCENES), "--seed", str(SEED), "--out", str(out)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "iwgnet_grasp.cli", *base, "--lift-check", "0", *arguments],
+        env=os.environ | {"PYTHONPATH": f"{ROOT / 'src'}:{os.environ.get('PYTHONPATH', '')}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=limit,
     )
+
+
+def assert_same_set(one: Path, other: Path) -> None:
+    assert files(one) == files(other)
+    _, differ, errors = filecmp.cmpfiles(one, other, files(one), shallow=False)
+    assert differ == [] and errors == []
 
 
 def test_every_crop_has_all_its_files_in_the_agreed_size(dataset):
@@ -89,12 +129,132 @@ def test_boxes_are_those_of_their_masks(dataset):
         assert list(bounding_box(mask > 0)) == entry["bbox"]
 
 
+def test_other_projects_loaders_find_what_they_expect(dataset):
+    """The facts of the layout that the loaders of GG-CNN and GR-ConvNet rely on: a folder level,
+    names by replacing grasps.txt, depth by imageio as 2-D float32, five numbers a line and one
+    character at its end, theta in degrees against the sense of Cornell's."""
+    found = sorted(dataset.glob("*/*_grasps.txt"))
+    ours = {s.stem.name: s.rectangles() for s in find_jacquard(dataset)}
+    assert len(found) == len(ours) > 0
+    for path in found:
+        for kind in ("perfect_depth.tiff", "stereo_depth.tiff"):
+            depth = imageio.imread(str(path).replace("grasps.txt", kind))
+            assert depth.shape == (CROP_PX, CROP_PX) and depth.dtype == np.float32
+            assert np.isfinite(depth).all() and (depth[depth < 0] == -1).all()
+        color = imageio.imread(str(path).replace("grasps.txt", "RGB.png"))
+        assert color.shape == (CROP_PX, CROP_PX, 3) and color.dtype == np.uint8
+        with path.open() as lines:
+            rows = np.array([[float(v) for v in line[:-1].split(";")] for line in lines])
+        assert path.read_bytes().count(b"\r\n") == len(rows)
+        expected = ours[path.name.removesuffix("_grasps.txt")]
+        np.testing.assert_allclose(rows[:, [0, 1, 3, 4]], expected[:, [X, Y, OPENING, JAW]], 1e-6)
+        turned = np.remainder(np.radians(-rows[:, 2]) - expected[:, THETA] + 1e-3, np.pi)
+        np.testing.assert_allclose(turned, 1e-3, atol=1e-4)
+
+
 def test_going_on_gives_the_same_set_as_one_run_on_two_workers(dataset, tmp_path):
     generate_dataset(1, SEED, tmp_path, ["connecting_rod"], 1, quiet=True)
     generate_dataset(SCENES, SEED, tmp_path, ["connecting_rod"], 2, quiet=True)
-    assert files(tmp_path) == files(dataset)
-    _, differ, errors = filecmp.cmpfiles(dataset, tmp_path, files(dataset), shallow=False)
+    assert_same_set(tmp_path, dataset)
+
+
+def test_a_set_without_colour_holds_the_same_depth_and_grasps(dataset, tmp_path):
+    generate_dataset(SCENES, SEED, tmp_path, ["connecting_rod"], 1, quiet=True, detector=False)
+    left_out = re.compile(r"detector/|.*_RGB\.png")
+    assert files(tmp_path) == [name for name in files(dataset) if not left_out.match(name)]
+    _, differ, errors = filecmp.cmpfiles(dataset, tmp_path, files(tmp_path), shallow=False)
     assert differ == [] and errors == []
+
+
+def test_a_killed_run_leaves_whole_scenes_and_goes_on(dataset, tmp_path):
+    run = command(tmp_path, "--workers", "1")
+    try:
+        limit = time.monotonic() + 120
+        while not any(tmp_path.glob("[0-9]*")) and time.monotonic() < limit:
+            time.sleep(0.01)
+    finally:
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+    assert 0 < len(list(tmp_path.glob("[0-9]*"))) <= SCENES
+    for name in files(tmp_path):
+        if "/." not in f"/{name}":  # what begins with a dot is no reader's business
+            assert (tmp_path / name).read_bytes() == (dataset / name).read_bytes()
+    generate_dataset(SCENES, SEED, tmp_path, ["connecting_rod"], 1, quiet=True)
+    assert_same_set(tmp_path, dataset)
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_scene(dataset, tmp_path):
+    largest = max((dataset / name).stat().st_size for name in files(dataset))
+    run = command(tmp_path, "--workers", "1", limit_bytes=largest // 2)
+    _, said = run.communicate(timeout=120)
+    assert run.returncode == 2
+    assert len(said.strip().splitlines()) == 1 and "make room" in said
+    assert not list(tmp_path.glob("[0-9]*")) and not list(tmp_path.rglob("*.part"))
+    assert json.loads((tmp_path / "detector" / "annotations.json").read_text())["images"] == []
+
+
+def test_an_address_without_a_cluster_is_one_line(tmp_path):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))  # bound but not listening: connections are refused
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
+        run = command(tmp_path, "--address", address)
+        _, said = run.communicate(timeout=120)
+    assert run.returncode == 2
+    assert len(said.strip().splitlines()) == 1 and f"nobody answers at {address}" in said
+
+
+def test_labels_are_lifted_and_the_agreement_is_kept(dataset):
+    lifts = json.loads((dataset / "lifts.json").read_text())
+    entries = [entry for scene in lifts.values() for entry in scene]
+    assert len(entries) >= LIFTS
+    for number, scene in lifts.items():
+        for entry in scene:
+            stem = f"{entry['object']}_{int(number):06d}"
+            lines = (dataset / f"{int(number):06d}" / f"{stem}_quality.txt").read_text().split()
+            assert float(lines[entry["grasp"]]) == pytest.approx(entry["quality"], abs=1e-4)
+    assert json.loads((dataset / "dataset.json").read_text())["lift_check"] == summary(entries)
+    # Scattered and stacked rods with labels from geometry: most hold by friction.
+    executed = [e for e in entries if e["outcome"] not in ("infeasible", "unreachable", "no_plan")]
+    assert sum(e["outcome"] == "lifted" for e in executed) >= 0.7 * len(executed) > 0
+
+
+@pytest.mark.parametrize("scenes, labels", [(1, 100), (4, 4), (200, 100), (1500, 300), (7, 1)])
+def test_a_lift_check_tries_as_many_labels_as_asked_for(scenes, labels):
+    piles, per_scene = plan_check(scenes, 3, labels)
+    tried = per_scene * sum(min(3, scenes - 3 * pile) for pile in piles)
+    assert len(set(piles)) == len(piles) and all(0 <= 3 * pile < scenes for pile in piles)
+    assert labels <= tried <= 2 * labels + 3
+
+
+def test_the_agreement_is_told_by_quality():
+    lifts = [{"quality": q, "outcome": o} for q, o in ((0.05, "slipped"), (0.9, "lifted"))]
+    report = summary([*lifts, {"quality": 1.0, "outcome": "lifted"}])
+    assert report["labels"] == 3 and report["lifted"] == pytest.approx(2 / 3, abs=1e-4)
+    assert report["outcomes"] == {"lifted": 2, "slipped": 1}
+    assert [(b["quality"], b["labels"], b["lifted"]) for b in report["by_quality"]] == [
+        ([0.0, 0.1], 1, 0.0),
+        ([0.8, 1.0], 2, 1.0),
+    ]
+
+
+def test_a_mesh_of_ones_own_is_labelled_like_any_part(tmp_path):
+    package = tmp_path / "package"
+    package.mkdir()
+    for name in ("config", "urdf"):
+        (package / name).symlink_to(ROOT / name)
+    (package / "assets").mkdir()
+    (package / "assets" / "robot").symlink_to(ROOT / "assets" / "robot")
+    trimesh.creation.annulus(14, 22, 60).export(tmp_path / "sleeve.stl")
+    part = part_from_mesh(tmp_path / "sleeve.stl", "sleeve", "mm", density=2700)
+    add_to_library(part, package / "assets" / "parts")
+    assert len(part.pieces) > 1  # a tube is not convex
+    scenes, crops = generate_dataset(
+        3, 0, tmp_path / "set", ["sleeve"], 1, quiet=True, package_dir=package, detector=False
+    )
+    assert scenes == 3 and crops > 0
+    rows = np.concatenate([s.rectangles() for s in find_jacquard(tmp_path / "set")])
+    # Outside 44 mm across and at most 60 mm long, seen at some 0.55 m with fx 640 px.
+    assert (rows[:, OPENING] > 40).all() and (rows[:, OPENING] < 85).all()
 
 
 def test_a_folder_with_another_set_is_refused(dataset):
