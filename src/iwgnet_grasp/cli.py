@@ -101,17 +101,21 @@ def train(
         seed=seed,
     )
     typer.echo(f"seed {seed}, network {network}, data {', '.join(map(str, data))}")
-    weights = train_grasp_network(
-        settings,
-        data,
-        out,
-        log_dir,
-        validation_data=validation_data,
-        initial=initial,
-        resume=resume,
-        limit=limit,
-        resources=TrainingResources(accelerator, devices, nodes, workers, threads),
-    )
+    try:
+        weights = train_grasp_network(
+            settings,
+            data,
+            out,
+            log_dir,
+            validation_data=validation_data,
+            initial=initial,
+            resume=resume,
+            limit=limit,
+            resources=TrainingResources(accelerator, devices, nodes, workers, threads),
+        )
+    except KeyboardInterrupt:
+        typer.echo("stopped; the same command with --resume goes on", err=True)
+        raise typer.Exit(130) from None
     typer.echo(f"wrote {weights} and {weights.with_suffix('.json')}")
 
 

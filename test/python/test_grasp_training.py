@@ -1,18 +1,23 @@
 """Training: metric, loss, and a network that learns, resumes and leaves a usable weight file."""
 
 import json
+import resource
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 import torch
+import yaml
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import Grasp
 from iwgnet_grasp.data.jacquard import format_grasps
 from iwgnet_grasp.networks.inference import GraspEstimator
 from iwgnet_grasp.training import grasp_training
+from iwgnet_grasp.training.card import describe_set
 from iwgnet_grasp.training.grasp_training import (
     GraspTrainingSettings,
     TrainingResources,
@@ -21,6 +26,7 @@ from iwgnet_grasp.training.grasp_training import (
 from iwgnet_grasp.training.losses import grasp_loss
 from iwgnet_grasp.training.rectangle_metric import matches
 
+ROOT = Path(__file__).resolve().parents[2]
 TRUTH = np.array([[100, 100, 0.2, 60, 30, 1], [40, 40, 1.5, 50, 25, 1]], np.float32)
 
 
@@ -90,13 +96,14 @@ def bar_set(root, count, seed=0):
 RESOURCES = TrainingResources(accelerator="cpu", workers=0, threads=1)
 
 
-def train(data, out, resume=False, **settings):
+def train(data, out, resume=False, initial=None, **settings):
     chosen = {"epochs": 2, "batch": 8, "input_px": 96} | settings
     return train_grasp_network(
         GraspTrainingSettings(**chosen),
         [data],
         out / "models",
         out / "logs",
+        initial=initial,
         resume=resume,
         resources=RESOURCES,
         progress=False,
@@ -142,6 +149,78 @@ def test_a_killed_run_ends_as_if_it_had_not_been(tmp_path, monkeypatch):
     for name, tensor in first["state_dict"].items():
         assert torch.equal(tensor, second["state_dict"][name]), name
     assert whole.with_suffix(".json").read_text() == halves.with_suffix(".json").read_text()
+
+
+def fails_to_resume(out, data, message, **settings):
+    with pytest.raises(DataError, match=message) as caught:
+        train(data, out, resume=True, **settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
+    data = bar_set(tmp_path / "data", 9)
+    train(data, tmp_path, network="ggcnn", epochs=1)
+    last = tmp_path / "logs" / "ggcnn" / "last.ckpt"
+    fails_to_resume(tmp_path, data, "epochs 1, not 3", network="ggcnn", epochs=3)
+    fails_to_resume(tmp_path, bar_set(tmp_path / "more", 18), "samples 8, not", network="ggcnn")
+    (tmp_path / "logs" / "iwgnet").mkdir()
+    shutil.copy(last, tmp_path / "logs" / "iwgnet")
+    fails_to_resume(tmp_path, data, "network ggcnn, not iwgnet", epochs=1)
+    stored = torch.load(last, weights_only=True)
+    torch.save({"state_dict": stored["state_dict"]}, tmp_path / "logs" / "iwgnet" / "last.ckpt")
+    fails_to_resume(tmp_path, data, "another network than this 'iwgnet'")
+    last.write_bytes(last.read_bytes()[:100_000])
+    fails_to_resume(tmp_path, data, "not a whole checkpoint", network="ggcnn", epochs=1)
+
+
+@pytest.mark.parametrize("limit_bytes", [100_000, 400_000])
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, limit_bytes):
+    """Files may not grow beyond a limit, the system's stand-in for a full disk: GG-CNN's weights
+    need 250 kB, its checkpoint with the optimizer's state 750 kB."""
+    data = bar_set(tmp_path / "data", 9)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        with pytest.raises(DataError, match="File too large; make room") as caught:
+            train(data, tmp_path, network="ggcnn", epochs=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value)
+    whole = limit_bytes > 300_000
+    assert (tmp_path / "models" / "ggcnn.safetensors").exists() == whole
+    assert not (tmp_path / "logs" / "ggcnn" / "last.ckpt").exists()
+    assert not [p for p in tmp_path.rglob(".*") if p.is_file()]
+    train(data, tmp_path, network="ggcnn", epochs=1)
+
+
+def test_the_card_tells_how_to_make_the_data_again(tmp_path):
+    settings = yaml.safe_load((ROOT / "config" / "dataset.yaml").read_text())
+    (tmp_path / "set").mkdir()
+    made = {"seed": 3, "scenes": 7, "families": ["tee"], "library": "ab", "settings": settings}
+    (tmp_path / "set" / "dataset.json").write_text(json.dumps(made))
+    described = describe_set(tmp_path / "set")
+    digest = described.pop("settings_sha256")
+    assert described == {"folder": "set", "settings": {}} | {
+        k: made[k] for k in ("seed", "scenes", "families", "library")
+    }
+    settings["camera"]["tilt"] = 0.5
+    (tmp_path / "set" / "dataset.json").write_text(json.dumps(made))
+    assert describe_set(tmp_path / "set")["settings"] == {"camera.tilt": 0.5}
+    assert describe_set(tmp_path / "set")["settings_sha256"] != digest
+    assert describe_set(tmp_path) == {"folder": tmp_path.name}
+
+
+def test_the_card_keeps_what_earlier_stages_did_otherwise(tmp_path):
+    data = bar_set(tmp_path / "data", 9)
+    first = train(data, tmp_path / "a", network="ggcnn", epochs=1)
+    second = train(
+        data, tmp_path / "b", network="ggcnn", epochs=1, learning_rate=1e-3, initial=first
+    )
+    third = train(data, tmp_path / "c", network="ggcnn", epochs=2, seed=5, initial=second)
+    card = json.loads(third.with_suffix(".json").read_text())
+    assert card["before"]["training"] == {"epochs": 1, "learning_rate": 1e-3, "seed": 0}
+    assert card["before"]["before"]["training"] == {"learning_rate": 2e-3}
+    assert "data" not in card["before"] and card["before"]["validation"]["top1"] >= 0
 
 
 def test_bad_requests_are_one_line(tmp_path):

@@ -22,6 +22,7 @@ from iwgnet_grasp.data.sample import GraspSample
 log = logging.getLogger(__name__)
 
 VIEW_PX = 300
+NAMED_BROKEN = 10  # files that are named; more of them are counted
 LAYOUTS = ("auto", "jacquard", "cornell")
 
 
@@ -57,17 +58,20 @@ def find_samples(root: str | Path, layout: str = "auto") -> list[GraspSample]:
 def load_views(
     samples: Iterable[GraspSample], progress: Callable[[int], None] | None = None
 ) -> Views:
-    """Reads samples into memory. A broken one is named in one warning and left out; DataError
-    when none is left."""
+    """Reads samples into memory. A broken one is named in one warning and left out, after
+    NAMED_BROKEN of them silently; DataError when none is left."""
     heights, rectangles, names = [], [], []
+    broken = 0
     for count, sample in enumerate(samples, start=1):
         try:
             height, rows = square_view(sample.depth(), sample.rectangles())
         except (DataError, ValueError) as error:
+            broken += 1
             message = str(error)
-            log.warning(
-                "%s", message if isinstance(error, DataError) else f"{sample.name}: {message}"
-            )
+            if broken <= NAMED_BROKEN:
+                log.warning(
+                    "%s", message if isinstance(error, DataError) else f"{sample.name}: {message}"
+                )
         else:
             heights.append(height.astype(np.float16))
             rectangles.append(rows)
@@ -75,7 +79,9 @@ def load_views(
         if progress:
             progress(count)
     if not names:
-        raise DataError("no sample could be read")
+        raise DataError(f"none of {broken} samples could be read; the warnings say why")
+    if broken:
+        log.warning("%d of %d samples were left out", broken, broken + len(names))
     return Views(np.stack(heights), rectangles, names)
 
 

@@ -1,6 +1,5 @@
 """Training of a grasp network: data folder in, weights and card out."""
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,16 +11,15 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from rich.progress import Progress
 from torch.utils.data import DataLoader
 
 from iwgnet_grasp.data.augmentation import Augmentation
-from iwgnet_grasp.data.depth import HEIGHT_CLIP, HEIGHT_UNIT
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.data.grasp_dataset import VIEW_PX, GraspDataset, Views, find_samples, load_views
+from iwgnet_grasp.data.grasp_dataset import GraspDataset, Views, find_samples, load_views
 from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
-from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
 from iwgnet_grasp.networks.weights import (
     load_state,
     load_weights,
@@ -29,6 +27,7 @@ from iwgnet_grasp.networks.weights import (
     save_weights,
     weights_path,
 )
+from iwgnet_grasp.training.card import earlier_stage, make_card
 from iwgnet_grasp.training.losses import grasp_loss
 from iwgnet_grasp.training.rectangle_metric import any_match
 
@@ -73,6 +72,7 @@ class GraspTraining(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.settings = settings
+        self.run: dict[str, Any] = asdict(settings)  # what a checkpoint must agree in
         self.views = training
         self.validation_set = GraspDataset(validation, settings.input_px)
         self.workers = workers
@@ -130,6 +130,9 @@ class GraspTraining(lightning.LightningModule):
             self.network.logits(heights.to(memory_format=torch.channels_last)), labels
         )
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["run"] = self.run
+
     def configure_optimizers(self) -> dict[str, Any]:
         settings = self.settings
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
@@ -146,6 +149,36 @@ class GraspTraining(lightning.LightningModule):
             pct_start=settings.warm_up,
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def check_checkpoint(path: Path, module: GraspTraining) -> None:
+    """DataError unless `module` can go on from the checkpoint as if it had never stopped."""
+    if not path.is_file():
+        raise DataError(f"{path}: no checkpoint to resume from; train without --resume")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        run, state = checkpoint.get("run", module.run), checkpoint["state_dict"]
+    except Exception as error:  # torch raises whatever its reader trips over
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise DataError(
+            f"{path}: not a whole checkpoint ({reason}); train without --resume"
+        ) from None
+    differing = [
+        f"{key} {run.get(key)}, not {value}"
+        for key, value in module.run.items()
+        if run.get(key) != value
+    ]
+    if differing:
+        raise DataError(
+            f"{path}: belongs to a training with {'; '.join(differing)}; give the same options "
+            "and data, or train without --resume"
+        )
+    shapes = {name: tensor.shape for name, tensor in module.state_dict().items()}
+    if {name: tensor.shape for name, tensor in state.items()} != shapes:
+        raise DataError(
+            f"{path}: holds another network than this '{module.settings.network}'; train without "
+            "--resume"
+        )
 
 
 class _Weights(Callback):
@@ -172,10 +205,12 @@ class _Weights(Callback):
         save_weights(module.network, self.path, card)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best": list(self.best)}
+        return {"best": list(self.best), "before": self.card.get("before")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.best = tuple(state["best"])
+        if state.get("before"):
+            self.card["before"] = state["before"]
 
 
 def train_grasp_network(
@@ -196,6 +231,7 @@ def train_grasp_network(
 
     DataError names data that cannot be used; ValueError an unknown network or setting. `resume`
     goes on from LOG_DIR/NETWORK/last.ckpt; a run that was killed ends as if it had not been.
+    KeyboardInterrupt when the user stops it.
     """
     resources = resources or TrainingResources()
     if settings.split not in SPLITS:
@@ -216,19 +252,21 @@ def train_grasp_network(
         training, held_out = split(samples, settings.validation, settings.seed)
     if not training or not held_out:
         raise DataError(f"{len(samples)} samples are too few to train and to validate on")
-    views, held_out_views = load_views(training), load_views(held_out)
+    with Progress(transient=True, disable=not progress) as bar:
+        task = bar.add_task("reading samples", total=len(training) + len(held_out))
+        views = load_views(training, lambda _: bar.advance(task))
+        held_out_views = load_views(held_out, lambda _: bar.advance(task))
     module = GraspTraining(settings, views, held_out_views, resources.workers)
 
     folder = log_dir / settings.network
     if initial and not resume:
         load_state(module.network, weights_path(initial), settings.network)
     weights = out / f"{settings.network}.safetensors"
-    card = _card(settings, module, data, len(views), validation_data, len(held_out_views))
-    if initial:
-        first = read_card(initial)
-        card["before"] = {
-            key: first.get(key) for key in ("epoch", "steps", "data", "training", "before")
-        }
+    parameters = count_parameters(module.network)
+    card = make_card(settings, parameters, data, len(views), validation_data, len(held_out_views))
+    if initial and not resume:
+        card["before"] = earlier_stage(read_card(initial), card)
+    module.run |= {"data": [folder.name for folder in data], "samples": len(views)}
     # Rewritten each epoch; the best weights are kept by _Weights.
     checkpoint = ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False)
     callbacks: list[Callback] = [_Weights(weights, card), checkpoint]
@@ -253,53 +291,16 @@ def train_grasp_network(
         reload_dataloaders_every_n_epochs=1,
     )
     last = folder / "last.ckpt"
-    if resume and not last.is_file():
-        raise DataError(f"{last}: no checkpoint to resume from; train without --resume")
-    trainer.fit(
-        module,
-        ckpt_path=last if resume else None,
-        weights_only=True,
-    )
+    if resume:
+        check_checkpoint(last, module)
+    try:
+        trainer.fit(module, ckpt_path=last if resume else None, weights_only=True)
+    except SystemExit:  # Lightning's way to end when the user stops it
+        raise KeyboardInterrupt from None
+    except OSError as error:
+        raise DataError(
+            f"{error.filename or folder}: {error.strerror or error}; make room, then go on with "
+            "--resume"
+        ) from None
     load_weights(weights)  # what was written can be read
     return weights
-
-
-def _card(
-    settings: GraspTrainingSettings,
-    module: GraspTraining,
-    data: Sequence[Path],
-    training_count: int,
-    validation_data: Path | None,
-    validation_count: int,
-) -> dict[str, Any]:
-    return {
-        "network": settings.network,
-        "parameters": count_parameters(module.network),
-        "input_px": settings.input_px,
-        "input": {
-            "quantity": "height above the table plane, holes filled",
-            "unit_m": HEIGHT_UNIT,
-            "clip": list(HEIGHT_CLIP),
-            "view_px": VIEW_PX,
-        },
-        "width_reference_px": WIDTH_REFERENCE_PX,
-        "data": {
-            "folders": [folder.name for folder in data],
-            "samples": training_count,
-            "generator": [_generator(folder) for folder in data],
-            "validation_folder": validation_data.name if validation_data else None,
-            "validation_samples": validation_count,
-        },
-        "training": asdict(settings),
-        "torch": torch.__version__,
-    }
-
-
-def _generator(data: Path) -> dict[str, Any] | None:
-    """dataset.json of a generated set: seed, scenes and settings."""
-    path = data / "dataset.json"
-    try:
-        return json.loads(path.read_text()) if path.is_file() else None
-    except ValueError:
-        log.warning("%s: not JSON, left out of the card", path)
-        return None
