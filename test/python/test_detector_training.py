@@ -1,6 +1,7 @@
 """Training of the detector: data, augmentation, learning, resuming, weights and card."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ from iwgnet_grasp.training.detector import (
     DetectorTrainingError,
     Phase,
     fit,
+    measure,
+    measure_batch_norm,
     network_input,
     train_detector,
 )
@@ -339,11 +342,48 @@ def test_command_writes_weights_that_load_and_a_card(tmp_path, capsys):
     card = read_card(output)
     assert card["network"] == "yolov5s" and card["labels"] == ["connecting_rod"]
     assert card["input"] == [128, 160] and card["parameters"] == 7_022_326
-    assert card["training"]["seed"] == 3 and card["data"]["train_scenes"] == 3
-    assert 0.0 <= card["metrics"]["map50"] <= 1.0
+    assert card["training"]["seed"] == 3 and card["data"]["scenes"] == 3
+    assert 0.0 <= card["validation"]["map50"] <= 1.0
     assert output.stat().st_size < 15e6
     load_state(YOLOv5s(1), output, "yolov5s")
     assert "epoch 1/1" in capsys.readouterr().out
+
+    later = tmp_path / "models" / "later.safetensors"
+    train_detector(
+        data=tmp_path / "set",
+        output=later,
+        config=config,
+        run=tmp_path / "later",
+        initial=output,
+        seed=4,
+    )
+    before = read_card(later)["before"]  # of the first stage what differs
+    assert before["training"] == {"seed": 3} and before["steps"] == 2
+    assert before["validation"] == card["validation"]
+
+
+def test_batch_norms_take_the_statistics_of_the_batches():
+    torch.manual_seed(2)
+    model = YOLOv5s(1)
+    batches = [(torch.randint(0, 255, (2, 3, 64, 64), dtype=torch.uint8), None) for _ in range(2)]
+    measure_batch_norm(model, batches)
+    first = model.stage2[0]
+    assert not model.training and first.bn.momentum == pytest.approx(0.03)
+    with torch.no_grad():
+        outputs = [first.conv(network_input(images)) for images, _ in batches]
+    mean = torch.stack([x.mean((0, 2, 3)) for x in outputs]).mean(0)
+    variance = torch.stack([x.var((0, 2, 3)) for x in outputs]).mean(0)
+    torch.testing.assert_close(first.bn.running_mean, mean, rtol=0.02, atol=0.005)
+    torch.testing.assert_close(first.bn.running_var, variance, rtol=0.05, atol=1e-4)
+
+
+def test_metrics_of_each_arrangement_stand_beside_those_of_all():
+    data = [
+        replace(scene(i), arrangement=kind) for i, kind in enumerate(("stacked", "", "stacked"))
+    ]
+    metrics = measure(YOLOv5s(1), data)
+    assert metrics["stacked"].keys() == {"scenes", "map50", "map50_95", "recall"}
+    assert metrics["stacked"]["scenes"] == 2 and "scattered" not in metrics
 
 
 @pytest.mark.parametrize(

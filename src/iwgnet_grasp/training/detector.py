@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from iwgnet_grasp.data.detection import (
+    Augmentation,
     DetectionScene,
     DetectionSet,
     DetectionWindows,
@@ -33,11 +34,13 @@ from iwgnet_grasp.data.detection import (
 from iwgnet_grasp.data.letterbox import WHOLE, Region, checked_region
 from iwgnet_grasp.networks.weights import load_state, read_card, save_weights
 from iwgnet_grasp.networks.yolov5s import ANCHORS, YOLOv5s, decode, non_maximum_suppression
+from iwgnet_grasp.training.card import describe_set, earlier_stage
 from iwgnet_grasp.training.detector_loss import LossWeights, detection_loss
 from iwgnet_grasp.training.detector_metrics import ImageBoxes, average_precision
 
 PACKAGE = Path(__file__).resolve().parents[3]
 DEFAULT_CONFIG = PACKAGE / "config" / "detector_training.yaml"
+IOU_THRESHOLD = 0.7  # of the suppression, as in config/perception.yaml
 
 Anchors = tuple[tuple[tuple[float, float], ...], ...]  # (width, height) px, three a scale
 
@@ -320,7 +323,7 @@ def compare(
     truth, found = [], []
     boxes, scores = decode(model(network_input(images)), model.anchors)
     for i in range(len(images)):
-        best = non_maximum_suppression(boxes[i], scores[i], 0.01, 0.6, 100)
+        best = non_maximum_suppression(boxes[i], scores[i], 0.01, IOU_THRESHOLD, 100)
         found.append(ImageBoxes(*(_array(best[k]) for k in (0, 2, 1))))
         mine = targets[targets[:, 0] == i]
         low, size = mine[:, 2:4] - mine[:, 4:] / 2, mine[:, 4:]
@@ -444,45 +447,15 @@ def train_detector(
     )
     if not module.trainer.is_global_zero:
         return
-    last = settings.phases[-1]
-    windows = DetectionWindows(
-        train.scenes,
-        settings.batch_norm_images,
-        last.size,
-        last.zoom,
-        settings.seed,
-        settings.epochs,
-    )
     if settings.batch_norm_images:
-        measure_batch_norm(
-            module.model, DataLoader(windows, batch_size=last.batch, collate_fn=collate)
-        )
+        measure_batch_norm(module.model, last_windows(settings, train.scenes))
     metrics = measure(module.model, test.scenes)
-    path = save_detector(
-        module.model,
-        output,
-        settings.input,
-        train.classes,
-        {
-            "region": list(settings.region),
-            "data": {
-                "set": data.name,
-                "validation_set": validation_data.name if validation_data else None,
-                "seed": data_seed(data),
-                "train_scenes": len(train.scenes),
-                "test_scenes": len(test.scenes),
-            },
-            "training": {
-                **asdict(settings),
-                "initial": initial and read_card(initial).get("training"),
-                "steps": settings.steps,
-                "images": sum(p.epochs * p.images for p in settings.phases),
-                "minutes": round((time.monotonic() - start) / 60, 1),
-                "torch": torch.__version__,
-            },
-            "metrics": rounded(metrics),
-        },
-    )
+    card = detector_card(settings, data, len(train.scenes), validation_data, len(test.scenes))
+    card["validation"] = rounded(metrics)
+    card["minutes"] = round((time.monotonic() - start) / 60, 1)
+    if initial is not None:
+        card["before"] = earlier_stage(read_card(initial), card)
+    path = save_detector(module.model, output, settings.input, train.classes, card)
     print(
         f"wrote {path}: mAP50 {metrics['map50']:.4f}, mAP50-95 {metrics['map50_95']:.4f}",
         flush=True,
@@ -494,12 +467,42 @@ def rounded(metrics: dict[str, Any]) -> dict[str, Any]:
     return {k: rounded(v) if isinstance(v, dict) else round(v, 4) for k, v in metrics.items()}
 
 
-def data_seed(folder: Path) -> int | None:
-    """The seed a data set was made with, None where it does not say."""
-    try:
-        return int(json.loads((folder / "dataset.json").read_text())["seed"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def detector_card(
+    settings: DetectorTrainingConfig,
+    data: Path,
+    training_count: int,
+    validation_data: Path | None,
+    validation_count: int,
+) -> dict[str, Any]:
+    """What the training adds to the card of save_detector."""
+    return {
+        "region": list(settings.region),
+        "data": {
+            "training": [describe_set(data)],
+            "scenes": training_count,
+            "validation": describe_set(validation_data) if validation_data else "a share of them",
+            "validation_scenes": validation_count,
+        },
+        # Lists for tuples, so that it equals what is read back.
+        "training": json.loads(json.dumps(asdict(settings))),
+        "augmentation": asdict(Augmentation()),
+        "steps": settings.steps,
+        "torch": torch.__version__,
+    }
+
+
+def last_windows(settings: DetectorTrainingConfig, scenes: Sequence[DetectionScene]) -> DataLoader:
+    """`batch_norm_images` windows as those of the last phase, which the training has not seen."""
+    phase = settings.phases[-1]
+    windows = DetectionWindows(
+        scenes,
+        settings.batch_norm_images,
+        phase.size,
+        phase.zoom,
+        settings.seed,
+        epoch=settings.epochs,
+    )
+    return DataLoader(windows, batch_size=phase.batch, collate_fn=collate)
 
 
 def network_input(images: Tensor) -> Tensor:
