@@ -49,7 +49,7 @@ def first_line(error: BaseException | None) -> str:
 
 
 def _knock(address: str) -> None:
-    """Raises ClusterError unless a Ray cluster answers; ray.init itself waits long and then aborts."""
+    """Raises ClusterError unless a Ray cluster answers; ray.init waits long and then aborts."""
     client = address.startswith("ray://")
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
@@ -63,10 +63,13 @@ def _knock(address: str) -> None:
         return
     check = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
     try:
-        done = subprocess.run(
-            check, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=ANSWER_SECONDS
-        )
+        done = subprocess.run(check, capture_output=True, text=True, timeout=ANSWER_SECONDS)
     except subprocess.TimeoutExpired:
         raise ClusterError(nobody) from None
+    if "AuthenticationError" in done.stderr:
+        raise ClusterError(
+            f"the Ray cluster at {address} asks for a token: set RAY_AUTH_MODE=token here, or "
+            "start it with RAY_AUTH_MODE=disabled on a network of your own"
+        )
     if done.returncode != 0:
         raise ClusterError(f"{nobody} (something listens that is no Ray)")

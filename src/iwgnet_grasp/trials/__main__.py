@@ -268,7 +268,7 @@ def checked_run(
         raise BatchError("--seed must not be negative")
     progress.begin(run, name)
     try:
-        return run_trials(run, out, workers, address, progress.found, progress.add)
+        return run_trials(run, out, workers, address, progress.found, progress.add, progress.say)
     except (KeyboardInterrupt, CellError, PoolError):
         if progress.finished:
             progress.say(

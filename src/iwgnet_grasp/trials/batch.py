@@ -56,10 +56,12 @@ def run_trials(
     address: str | None = None,
     on_start: Callable[[list[Record]], None] = lambda records: None,
     on_record: Callable[[Record], None] = lambda record: None,
+    say: Callable[[str], None] = print,
 ) -> dict:
     """Runs what is still to be run; returns the summary, which is also in out/summary.json.
 
-    on_start is told the trials that the folder holds already, on_record each new one. Raises
+    on_start is told the trials that the folder holds already, on_record each new one, `say` what
+    else a person should know. Raises
     BatchError for a folder of another run, PoolError or CellError when trials cannot go on; what
     was finished stays in the folder, also after KeyboardInterrupt.
     """
@@ -73,7 +75,7 @@ def run_trials(
     try:
         if tasks:
             with (out / "trials.jsonl").open("a") as file:
-                for record in _records(run.conditions, tasks, out / "logs", workers, address):
+                for record in _records(run.conditions, tasks, out, workers, address, say):
                     record["commit"] = commit
                     file.write(json.dumps(record, allow_nan=False) + "\n")
                     file.flush()
@@ -87,12 +89,17 @@ def run_trials(
 
 
 def _records(
-    conditions: Conditions, tasks: Sequence[Task], logs: Path, workers: int, address: str | None
+    conditions: Conditions,
+    tasks: Sequence[Task],
+    out: Path,
+    workers: int,
+    address: str | None,
+    say: Callable[[str], None],
 ) -> Iterator[Record]:
-    make = functools.partial(make_worker, conditions, logs.resolve())
+    make = functools.partial(make_worker, conditions, (out / "logs").resolve())
     if workers == 1 and address is None:
         return run_here(make, tasks)
-    return run_with_ray(make, tasks, workers, address)
+    return run_with_ray(make, tasks, workers, address, say)
 
 
 def read_records(out: Path) -> list[Record]:

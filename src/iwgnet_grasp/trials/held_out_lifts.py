@@ -90,7 +90,8 @@ def lift_all(
 
     grasps: in px of the stored crop (in_view), by object. kept: file that outcomes are read from
     and appended to. Objects whose scene does not come out as it is stored have no outcome.
-    progress(n) is told of n grasps that are done. Raises LiftsUnavailable or DataError.
+    progress(n) is told of n grasps that are done. Raises LiftsUnavailable without the extension,
+    DataError.
     """
     from iwgnet_grasp.data.scene_pool import SceneKind, library_digest, open_pool
 

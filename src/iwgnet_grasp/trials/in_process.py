@@ -29,6 +29,8 @@ PACKAGE = Path(__file__).resolve().parents[3]
 class Perceives(Protocol):
     """perception.Perception."""
 
+    backends: dict[str, str]
+
     def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look: ...
 
 
@@ -58,6 +60,7 @@ class InProcessCell:
         config_dir = config_dir or package_dir / "config"
         self._core = core
         self._perception = perception
+        self.backends = perception.backends
         self.on_plan: Callable[[Plan], None] | None = None
         self._priority = PriorityConfig.load(config_dir / "priority.yaml")
         self.simulated = core.SimulatedCell(str(package_dir), str(config_dir))
@@ -237,6 +240,7 @@ def run(
         scene=scene,
         seed=seed,
         transport="in_process",
+        backends=cell.backends,
         out=out,
         judge=cell.judge,
         say=say,

@@ -38,10 +38,12 @@ def run_with_ray(
     tasks: Sequence[Task],
     workers: int,
     address: str | None = None,
+    say: Callable[[str], None] = print,
 ) -> Iterator[Record]:
     """Records of the tasks as they end, from `workers` Ray actors of one core each.
 
-    address: see cluster.connect(). A trial whose worker died is tried once more, on a new one.
+    address: see cluster.connect(). A trial whose worker died is tried once more, on a new one;
+    `say` is told.
     Raises ClusterError when there is no such cluster, PoolError when a worker cannot work or a
     trial kills its workers.
     """
@@ -50,12 +52,12 @@ def run_with_ray(
     for number, handler in handlers.items():  # Ray's own print a stack
         signal.signal(number, handler)
     try:
-        yield from _from_actors(ray, make_worker, tasks, workers)
+        yield from _from_actors(ray, make_worker, tasks, workers, say)
     finally:
         ray.shutdown()
 
 
-def _from_actors(ray, make_worker, tasks, workers) -> Iterator[Record]:
+def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
     actor_class = ray.remote(num_cpus=1, max_restarts=0)(_Actor)
     waiting = list(reversed(tasks))
     idle = [actor_class.remote(make_worker) for _ in range(min(workers, len(tasks)))]
@@ -70,12 +72,13 @@ def _from_actors(ray, make_worker, tasks, workers) -> Iterator[Record]:
         try:
             record = ray.get(done)
         except ray.exceptions.RayActorError as error:
+            scene, seed = task
             if task in died:
-                scene, seed = task
                 raise PoolError(
                     f"the worker of {scene} seed {seed} died twice ({first_line(error)}); alone: "
                     f"scripts/run_trials --scene {scene} --seed {seed} --trials 1"
                 ) from None
+            say(f"a worker died in {scene} seed {seed}; another tries that trial once more")
             died.add(task)
             waiting.append(task)
             idle.append(actor_class.remote(make_worker))

@@ -24,6 +24,7 @@ class Trial:
     seed: int
     replan: str
     transport: str  # ros | in_process
+    backends: dict[str, str] = field(default_factory=dict)  # library by network, where known
     cycle: Cycle = field(default_factory=Cycle)
     verdict: Verdict | None = None
     sim_time_s: float = 0.0
@@ -51,6 +52,7 @@ class Trial:
             "seed": self.seed,
             "replan": self.replan,
             "transport": self.transport,
+            "backends": self.backends,
             "success": self.success,
             "objects": verdict.get("parts"),
             "in_tray": verdict.get("in_tray"),
@@ -172,6 +174,7 @@ def run_trial(
     scene: str,
     seed: int,
     transport: str,
+    backends: dict[str, str] | None = None,
     out: Path | None = None,
     judge: Callable[[], Verdict] | None = None,
     say: Callable[[str], None] = print,
@@ -179,7 +182,7 @@ def run_trial(
     """Runs a trial to its end. out/trial.json is brought up to date after each pick and at the
     end, also when the trial breaks off: CellError ends in Trial.error, KeyboardInterrupt is
     raised again after the file is written."""
-    trial = Trial(scene, seed, settings.replan, transport)
+    trial = Trial(scene, seed, settings.replan, transport, backends or {})
     trial.cycle.ended = "running"
     wall_start = time.monotonic()
     sim_start = math.nan

@@ -15,7 +15,7 @@ from iwgnet_grasp.trials.statistics import Record, causes
 from iwgnet_grasp.trials.worker import Conditions, InProcessWorker
 
 # What a second run of the same trial may differ in: time of the wall, and where and by what it ran.
-_MAY_DIFFER = ("wall_time_s", "computing_time_s", "commit", "backend", "transport")
+_MAY_DIFFER = ("wall_time_s", "computing_time_s", "commit", "backends", "transport")
 
 
 @dataclass

@@ -80,7 +80,6 @@ class InProcessWorker(_Configured):
         from iwgnet_grasp.trials.in_process import InProcessCell, load_calibration
 
         perception = load_perception(self._config_dir / "perception.yaml")
-        self.backend = perception.estimator.backend
         calibrated = load_calibration(conditions.calibration) if conditions.calibration else None
         self.cell = InProcessCell(perception, config_dir=self._config_dir, T_base_color=calibrated)
         if conditions.camera_offset >= 0:
@@ -98,7 +97,7 @@ class InProcessWorker(_Configured):
             say=lambda line: None,
             config_dir=self._config_dir,
         )
-        return self._finished({**trial.to_json(), "backend": self.backend})
+        return self._finished(trial.to_json())
 
 
 class RosWorker(_Configured):
