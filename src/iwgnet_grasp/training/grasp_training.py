@@ -1,5 +1,6 @@
 """Training of a grasp network: data folder in, weights and card out."""
 
+import io
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.progress import Progress
 from torch.utils.data import DataLoader
 
@@ -18,6 +20,7 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_dataset import GraspDataset, Views, find_samples, load_views
 from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
+from iwgnet_grasp.files import write_whole
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.weights import (
@@ -181,6 +184,17 @@ def check_checkpoint(path: Path, module: GraspTraining) -> None:
         )
 
 
+class _WholeCheckpoints(TorchCheckpointIO):
+    """Lightning's own way copies from a temporary folder: a full disk would leave half a file."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        write_whole(Path(path), content.getvalue())
+
+
 class _Weights(Callback):
     """Writes weights and card whenever the validation has got better."""
 
@@ -284,6 +298,7 @@ def train_grasp_network(
         max_epochs=settings.epochs,
         logger=TensorBoardLogger(folder, name="", version=""),
         callbacks=callbacks,
+        plugins=[_WholeCheckpoints()],
         enable_progress_bar=progress,
         enable_model_summary=False,
         num_sanity_val_steps=0,
@@ -298,9 +313,9 @@ def train_grasp_network(
     except SystemExit:  # Lightning's way to end when the user stops it
         raise KeyboardInterrupt from None
     except OSError as error:
+        again = "run it again with --resume" if last.is_file() else "run it again"
         raise DataError(
-            f"{error.filename or folder}: {error.strerror or error}; make room, then go on with "
-            "--resume"
+            f"{error.filename or folder}: {error.strerror or error}; make room, then {again}"
         ) from None
     load_weights(weights)  # what was written can be read
     return weights
