@@ -15,7 +15,10 @@ SCENE_BYTES = 64 * 1024 * 1024  # a scene at 1280x800 px has 11 MB; rospy reads 
 
 class PerceptionNode:
     def __init__(self) -> None:
-        self.perception = load_perception(rospy.get_param("~config", str(DEFAULT_CONFIG)))
+        self.perception = load_perception(
+            rospy.get_param("~config", str(DEFAULT_CONFIG)), rospy.get_param("~backend", "")
+        )
+        rospy.set_param("~backends", self.perception.backends)  # for the record of a trial
         self.grasps = rospy.Publisher(Topics.GRASPS, SceneGrasps, queue_size=1, latch=True)
         rospy.Subscriber(
             Topics.SCENE,

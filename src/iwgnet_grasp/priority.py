@@ -8,15 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from iwgnet_grasp.perception.config import read_config
 from iwgnet_grasp.perception.pipeline import PACKAGE, same_grasp
-from iwgnet_grasp.perception.types import (
-    CameraIntrinsics,
-    GraspRectangle,
-    ObjectGrasps,
-    PerceptionError,
-)
+from iwgnet_grasp.perception.types import CameraIntrinsics, GraspRectangle, ObjectGrasps
 
 DEFAULT_CONFIG = PACKAGE / "config" / "priority.yaml"
 
@@ -25,44 +20,29 @@ DEFAULT_CONFIG = PACKAGE / "config" / "priority.yaml"
 class PriorityConfig:
     """config/priority.yaml."""
 
-    alpha: float = 1.0  # weight of D
-    beta: float = 1.0  # weight of G
-    min_quality: float = 0.0  # a best grasp below it is tried after all others
-    failed_radius_px: float = 15.0
-    failed_angle_rad: float = math.radians(25.0)
-    random_order: bool = False  # S* is drawn, not computed: for comparison
+    alpha: float  # weight of D
+    beta: float  # weight of G
+    min_quality: float  # a best grasp below it is tried after all others
+    failed_radius_px: float
+    failed_angle_rad: float
+    random_order: bool  # S* is drawn, not computed: for comparison
 
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> PriorityConfig:
         """Raises PerceptionError for a file that is missing, malformed or lacks a key."""
-        path = Path(path)
-        try:
-            text = yaml.safe_load(path.read_text())
-            config = PriorityConfig(
-                alpha=float(text["alpha"]),
-                beta=float(text["beta"]),
-                min_quality=float(text["min_quality"]),
-                failed_radius_px=float(text["failed_radius_px"]),
-                failed_angle_rad=math.radians(float(text["failed_angle_deg"])),
-                random_order=bool(text["random_order"]),
-            )
-        except OSError as error:
-            raise PerceptionError(f"{path}: cannot be read ({error.strerror})") from error
-        except KeyError as error:
-            raise PerceptionError(f"{path}: key {error} is missing") from error
-        except (yaml.YAMLError, TypeError, ValueError) as error:
-            line = " ".join(str(error).split())
-            raise PerceptionError(f"{path}: not a valid priority config ({line})") from error
-        values = (
-            config.alpha,
-            config.beta,
-            config.min_quality,
-            config.failed_radius_px,
-            config.failed_angle_rad,
+        return read_config(path, "priority config", PriorityConfig._of)
+
+    @staticmethod
+    def _of(text: dict) -> PriorityConfig:
+        names = ("alpha", "beta", "min_quality", "failed_radius_px", "failed_angle_deg")
+        values = [float(text[name]) for name in names]
+        if not all(math.isfinite(value) and value >= 0 for value in values):
+            raise ValueError(f"{', '.join(names)} must be finite and >= 0")
+        return PriorityConfig(
+            *values[:-1],
+            failed_angle_rad=math.radians(values[-1]),
+            random_order=bool(text["random_order"]),
         )
-        if not all(math.isfinite(v) and v >= 0 for v in values):
-            raise PerceptionError(f"{path}: all values must be finite and >= 0")
-        return config
 
 
 @dataclass(frozen=True)

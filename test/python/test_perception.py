@@ -20,7 +20,7 @@ from iwgnet_grasp.perception import (
     PerceptionError,
     load_perception,
 )
-from iwgnet_grasp.perception.detector import Detector, resolve_backend
+from iwgnet_grasp.perception.detector import Detector
 from iwgnet_grasp.perception.merged_depth import (
     MARGIN_PX,
     centroid,
@@ -302,10 +302,10 @@ def test_backends_see_the_same(weights):
     maps = {}
     for backend in ("torch", "openvino"):
         detector = Detector(weights, backend=backend, score_threshold=0.0)
-        pixels = torch.from_numpy(image[:96, :160].transpose(2, 0, 1).copy())[None]
-        maps[backend] = [m.clone() for m in detector._forward(pixels)]
+        pixels = image[:96, :160].transpose(2, 0, 1)[None]
+        maps[backend] = detector._run(pixels)
     for ours, theirs in zip(maps["torch"], maps["openvino"], strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=0.05, atol=0.05)
+        np.testing.assert_allclose(ours, theirs, rtol=0.05, atol=0.05)
 
 
 def test_boxes_stay_inside_the_image_and_are_sorted(weights):
@@ -317,6 +317,26 @@ def test_boxes_stay_inside_the_image_and_are_sorted(weights):
         assert d.label == "rod"
         assert 0 <= d.box.x < d.box.x + d.box.width <= 320
         assert 0 <= d.box.y < d.box.y + d.box.height <= 250
+
+
+def overlaps(a: Box, b: Box) -> bool:
+    across = min(a.x + a.width, b.x + b.width) - max(a.x, b.x)
+    down = min(a.y + a.height, b.y + b.height) - max(a.y, b.y)
+    return across > 0 and down > 0
+
+
+def test_only_the_region_is_looked_at(weights):
+    region = (0.25, 0.1, 0.75, 0.9)
+    image = np.random.default_rng(1).integers(0, 255, (250, 320, 3), dtype=np.uint8)
+    detector = Detector(weights, backend="torch", score_threshold=0.0, region=region)
+    found = detector.detect(image)
+    elsewhere = image.copy()
+    elsewhere[:25], elsewhere[225:], elsewhere[:, :80], elsewhere[:, 240:] = 0, 0, 0, 0
+    assert detector.detect(elsewhere) == found
+    cut = Detector(weights, backend="torch", score_threshold=0.0).detect(image[25:225, 80:240])
+    # The cut image has no room for boxes in the grey beside the region.
+    inside = [d for d in found if overlaps(d.box, Box(80, 25, 160, 200))]
+    assert [d.score for d in inside] == pytest.approx([d.score for d in cut])
 
 
 def test_a_missing_weight_file_says_how_to_make_it(tmp_path):
@@ -341,9 +361,9 @@ def test_a_card_of_another_network_is_refused(weights, tmp_path):
         Detector(other)
 
 
-def test_unknown_backend_is_refused():
-    with pytest.raises(PerceptionError, match="tensorrt"):
-        resolve_backend("tensorrt")
+def test_unknown_backend_is_refused(weights):
+    with pytest.raises(PerceptionError, match="no backend 'caffe'; known: auto, torch"):
+        Detector(weights, backend="caffe")
 
 
 # Config -------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def look(count: int) -> Look:
 def test_four_readable_pictures(tmp_path, count):
     seen = look(count)
     paths = write_pictures(
-        tmp_path / "pictures", seen, rank(seen.objects, CAMERA, PriorityConfig()), prefix="1_"
+        tmp_path / "pictures", seen, rank(seen.objects, CAMERA, PriorityConfig.load()), prefix="1_"
     )
     assert [p.name for p in paths] == [
         "1_scene.png",
@@ -72,13 +72,13 @@ def test_objects_without_depth_or_grasp_are_drawn_too(tmp_path):
         valid_pixels=0,
     )
     seen = replace(seen, objects=(seen.objects[0], blind, replace(seen.objects[2], grasps=())))
-    ranking = rank(seen.objects, CAMERA, PriorityConfig())
+    ranking = rank(seen.objects, CAMERA, PriorityConfig.load())
     assert len(write_pictures(tmp_path, seen, ranking)) == 4
 
 
 def test_chosen_grasp_is_drawn_instead_of_the_best(tmp_path):
     seen = look(1)
-    ranking = rank(seen.objects, CAMERA, PriorityConfig())
+    ranking = rank(seen.objects, CAMERA, PriorityConfig.load())
     other = GraspRectangle(420.0, 310.0, 1.2, 60.0, 0.3, 0.58)
     best = write_pictures(tmp_path / "best", seen, ranking)[3].read_bytes()
     chosen = write_pictures(tmp_path / "chosen", seen, ranking, {0: other})[3].read_bytes()

@@ -23,7 +23,14 @@ from iwgnet_grasp.priority import (
 )
 
 CAMERA = CameraIntrinsics(640.0, 640.0, 639.5, 399.5)
-CONFIG = PriorityConfig(alpha=1.0, beta=1.0)
+CONFIG = PriorityConfig(  # Eq. 17 as it is, with equal weights
+    alpha=1.0,
+    beta=1.0,
+    min_quality=0.0,
+    failed_radius_px=15.0,
+    failed_angle_rad=math.radians(25.0),
+    random_order=False,
+)
 
 
 def grasp(x=700.0, y=400.0, depth=0.58, theta=0.0, quality=0.9) -> GraspRectangle:
@@ -57,7 +64,7 @@ def test_terms_and_order_of_three_objects():
     far = thing(1, grasp(depth=0.59), depth=0.59)  # G = 0
     # 32 px at 0.56 m: G = 0.028 m
     off = thing(2, grasp(x=732.0, depth=0.56), depth=0.56)
-    ranking = rank([far, off, near], CAMERA, PriorityConfig(alpha=1.0, beta=0.5))
+    ranking = rank([far, off, near], CAMERA, replace(CONFIG, alpha=1.0, beta=0.5))
     assert ids(ranking) == [0, 2, 1]
     first, second, third = ranking.objects
     assert (first.score, second.score, third.score) == pytest.approx((0.55, 0.574, 0.59))
@@ -71,8 +78,8 @@ def test_weights_decide_between_height_and_centroid():
     high_off_centre = thing(0, grasp(x=760.0, depth=0.56), depth=0.56)  # D 0.56, G 0.0525
     low_centred = thing(1, grasp(depth=0.59), depth=0.59)  # D 0.59, G 0
     objects = [high_off_centre, low_centred]
-    assert ids(rank(objects, CAMERA, PriorityConfig(alpha=1.0, beta=0.0))) == [0, 1]
-    assert ids(rank(objects, CAMERA, PriorityConfig(alpha=0.0, beta=1.0))) == [1, 0]
+    assert ids(rank(objects, CAMERA, replace(CONFIG, alpha=1.0, beta=0.0))) == [0, 1]
+    assert ids(rank(objects, CAMERA, replace(CONFIG, alpha=0.0, beta=1.0))) == [1, 0]
     assert ids(rank(objects, CAMERA, CONFIG)) == [1, 0]
 
 

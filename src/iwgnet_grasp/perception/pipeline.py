@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import yaml
 
+from iwgnet_grasp.data.letterbox import Region, checked_region
+from iwgnet_grasp.perception.config import read_config
 from iwgnet_grasp.perception.merged_depth import (
     centroid,
     crop_window,
@@ -35,6 +36,8 @@ DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
 class ObjectDetector(Protocol):
     """perception.detector.Detector."""
 
+    backend: str
+
     def detect(self, color: np.ndarray) -> list[Detection]: ...
 
 
@@ -42,6 +45,7 @@ class WindowGrasps(Protocol):
     """networks.inference.GraspEstimator: grasps of each window in the window's own px."""
 
     input_px: int
+    backend: str
 
     def predict(self, depth: np.ndarray, empty: np.ndarray) -> list[list[Any]]: ...
 
@@ -52,10 +56,12 @@ class PerceptionConfig:
 
     detector_weights: Path
     detector_backend: str
+    detector_region: Region | None
     score_threshold: float
     iou_threshold: float
     max_objects: int
     grasp_weights: Path
+    grasp_backend: str
     candidates: int
     min_distance_px: float
     min_angle_rad: float
@@ -65,30 +71,27 @@ class PerceptionConfig:
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> PerceptionConfig:
         """Raises PerceptionError for a file that is missing, malformed or lacks a key."""
-        path = Path(path)
-        try:
-            text = yaml.safe_load(path.read_text())
-            detector, grasps, pixels = text["detector"], text["grasps"], text["object_pixels"]
-            return PerceptionConfig(
-                detector_weights=_in_package(detector["weights"]),
-                detector_backend=str(detector["backend"]),
-                score_threshold=float(detector["score_threshold"]),
-                iou_threshold=float(detector["iou_threshold"]),
-                max_objects=int(detector["max_objects"]),
-                grasp_weights=_in_package(grasps["weights"]),
-                candidates=int(grasps["candidates"]),
-                min_distance_px=float(grasps["min_distance_px"]),
-                min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
-                min_height=float(pixels["min_height"]),
-                grasp_depth_radius_px=float(pixels["grasp_depth_radius_px"]),
-            )
-        except OSError as error:
-            raise PerceptionError(f"{path}: cannot be read ({error.strerror})") from error
-        except KeyError as error:
-            raise PerceptionError(f"{path}: key {error} is missing") from error
-        except (yaml.YAMLError, TypeError, ValueError) as error:
-            line = " ".join(str(error).split())
-            raise PerceptionError(f"{path}: not a valid perception config ({line})") from error
+        return read_config(path, "perception config", PerceptionConfig._of)
+
+    @staticmethod
+    def _of(text: dict) -> PerceptionConfig:
+        detector, grasps, pixels = text["detector"], text["grasps"], text["object_pixels"]
+        region = detector["region"]
+        return PerceptionConfig(
+            detector_weights=_in_package(detector["weights"]),
+            detector_backend=str(detector["backend"]),
+            detector_region=region and checked_region(region),
+            score_threshold=float(detector["score_threshold"]),
+            iou_threshold=float(detector["iou_threshold"]),
+            max_objects=int(detector["max_objects"]),
+            grasp_weights=_in_package(grasps["weights"]),
+            grasp_backend=str(grasps["backend"]),
+            candidates=int(grasps["candidates"]),
+            min_distance_px=float(grasps["min_distance_px"]),
+            min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
+            min_height=float(pixels["min_height"]),
+            grasp_depth_radius_px=float(pixels["grasp_depth_radius_px"]),
+        )
 
 
 class Perception:
@@ -100,6 +103,11 @@ class Perception:
         self.config = config
         self.detector = detector
         self.estimator = estimator
+
+    @property
+    def backends(self) -> dict[str, str]:
+        """The library that runs each network."""
+        return {"detector": self.detector.backend, "grasps": self.estimator.backend}
 
     def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look:
         """All objects of one look with their grasps, in descending order of detection score.
@@ -183,8 +191,10 @@ class Perception:
         )
 
 
-def load_perception(path: str | Path = DEFAULT_CONFIG) -> Perception:
-    """Perception with the weights that a config file names. Raises PerceptionError."""
+def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Perception:
+    """Perception with the weights that a config file names. backend: in place of the config's,
+    for both networks. Raises PerceptionError."""
+    from iwgnet_grasp.networks.backends import BackendError
     from iwgnet_grasp.networks.inference import GraspEstimator
     from iwgnet_grasp.networks.weights import WeightsError
     from iwgnet_grasp.perception.detector import Detector
@@ -195,11 +205,12 @@ def load_perception(path: str | Path = DEFAULT_CONFIG) -> Perception:
         score_threshold=config.score_threshold,
         iou_threshold=config.iou_threshold,
         max_objects=config.max_objects,
-        backend=config.detector_backend,
+        backend=backend or config.detector_backend,
+        region=config.detector_region,
     )
     try:
-        estimator = GraspEstimator(config.grasp_weights)
-    except WeightsError as error:
+        estimator = GraspEstimator(config.grasp_weights, backend or config.grasp_backend)
+    except (WeightsError, BackendError) as error:
         raise PerceptionError(str(error)) from error
     return Perception(config, detector, estimator)
 

@@ -83,6 +83,7 @@ def _on_graph(
             scene=scene,
             seed=options.seed,
             transport="ros",
+            backends=rospy.get_param("/perception/backends", {}),
             out=options.out,
             judge=cell.judge if simulated else None,
         )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +23,12 @@ _IMAGE_TYPES = {  # encoding: (numpy type, channels)
     "16UC1": (np.uint16, 1),
     "32FC1": (np.float32, 1),
 }
+
+
+# Fields that a message and its value have in common, by the same names.
+_GRASP = {f.name for f in fields(GraspRectangle)}
+_OBJECT = {f.name for f in fields(ObjectGrasps)} - {"box", "grasps"}
+_RANKED = {f.name for f in fields(RankedObject)} - {"object"}
 
 
 def image_array(image, name: str) -> np.ndarray:
@@ -60,25 +68,11 @@ def camera_intrinsics(info) -> CameraIntrinsics:
 
 
 def grasp_to_message(grasp: GraspRectangle) -> msg.GraspRectangle:
-    return msg.GraspRectangle(
-        x_px=grasp.x_px,
-        y_px=grasp.y_px,
-        theta_rad=grasp.theta_rad,
-        width_px=grasp.width_px,
-        quality=grasp.quality,
-        depth_m=grasp.depth_m,
-    )
+    return msg.GraspRectangle(**_named(grasp, _GRASP))
 
 
 def grasp_from_message(message: msg.GraspRectangle) -> GraspRectangle:
-    return GraspRectangle(
-        x_px=message.x_px,
-        y_px=message.y_px,
-        theta_rad=message.theta_rad,
-        width_px=message.width_px,
-        quality=message.quality,
-        depth_m=message.depth_m,
-    )
+    return GraspRectangle(**_named(message, _GRASP))
 
 
 def failed_to_message(failed: Iterable[GraspRectangle], header) -> msg.FailedGrasps:
@@ -87,14 +81,7 @@ def failed_to_message(failed: Iterable[GraspRectangle], header) -> msg.FailedGra
 
 def object_to_message(value: ObjectGrasps) -> msg.ObjectGrasps:
     message = msg.ObjectGrasps(
-        object_id=value.object_id,
-        label=value.label,
-        score=value.score,
-        centroid_u_px=value.centroid_u_px,
-        centroid_v_px=value.centroid_v_px,
-        centroid_depth_m=value.centroid_depth_m,
-        valid_pixels=value.valid_pixels,
-        grasps=[grasp_to_message(g) for g in value.grasps],
+        grasps=[grasp_to_message(g) for g in value.grasps], **_named(value, _OBJECT)
     )
     box = message.box
     box.x_offset, box.y_offset = value.box.x, value.box.y
@@ -105,35 +92,19 @@ def object_to_message(value: ObjectGrasps) -> msg.ObjectGrasps:
 def object_from_message(message: msg.ObjectGrasps) -> ObjectGrasps:
     box = message.box
     return ObjectGrasps(
-        object_id=message.object_id,
-        label=message.label,
-        score=message.score,
         box=Box(box.x_offset, box.y_offset, box.width, box.height),
-        centroid_u_px=message.centroid_u_px,
-        centroid_v_px=message.centroid_v_px,
-        centroid_depth_m=message.centroid_depth_m,
-        valid_pixels=message.valid_pixels,
         grasps=tuple(grasp_from_message(g) for g in message.grasps),
+        **_named(message, _OBJECT),
     )
 
 
 def ranked_to_message(value: RankedObject) -> msg.RankedObject:
-    return msg.RankedObject(
-        object=object_to_message(value.object),
-        depth_distance_m=value.depth_distance_m,
-        centroid_distance_m=value.centroid_distance_m,
-        score=value.score,
-        priority=value.priority,
-        reason=value.reason,
-    )
+    return msg.RankedObject(object=object_to_message(value.object), **_named(value, _RANKED))
 
 
 def ranked_from_message(message: msg.RankedObject) -> RankedObject:
-    return RankedObject(
-        object=object_from_message(message.object),
-        depth_distance_m=message.depth_distance_m,
-        centroid_distance_m=message.centroid_distance_m,
-        score=message.score,
-        priority=message.priority,
-        reason=message.reason,
-    )
+    return RankedObject(object=object_from_message(message.object), **_named(message, _RANKED))
+
+
+def _named(source, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in names}
