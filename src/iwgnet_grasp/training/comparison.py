@@ -4,7 +4,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.networks.weights import WeightsError, load_weights
+from iwgnet_grasp.networks.weights import WeightsError, load_weights, weights_path
 from iwgnet_grasp.perception.types import PerceptionError
 from iwgnet_grasp.training.evaluation import (
     NetworkRun,
@@ -36,6 +36,7 @@ from iwgnet_grasp.trials.held_out_lifts import (
     choose_objects,
     in_view,
     lift_all,
+    simulator_digest,
 )
 from iwgnet_grasp.trials.statistics import wilson_interval
 
@@ -69,12 +70,22 @@ def compare_networks(
     names = [s.name for s in sets]
     if len(set(names)) < len(names):
         raise DataError(f"data folders of the same name: {', '.join(sorted(names))}")
+    if lifts:
+        try:
+            simulator_digest()
+        except LiftsUnavailable as error:
+            log.warning("lifts: %s; left out", error)
+            lifts = 0
     with _bar(progress) as bar:
         objects = sum(len(s.views) for s in sets)
         runs = []
+        stems = Counter(weights_path(name).stem for name in usable)
         for name in usable:
-            task = bar.add_task(f"predictions of {name}", total=objects)
-            runs.append(run_network(name, sets, backend, lambda t=task: bar.advance(t)))
+            stem = weights_path(name).stem
+            label = stem if stems[stem] == 1 else str(name)
+            task = bar.add_task(f"predictions of {label}", total=objects)
+            run = run_network(name, sets, backend, lambda t=task: bar.advance(t))
+            runs.append(replace(run, weights=label))
         lifted = {
             held_out.name: _lift(held_out, runs, lifts, seed, out, workers, address, bar)
             for held_out in sets
@@ -98,8 +109,8 @@ def _each(names: Sequence, load) -> dict[Any, Any]:
             if len(names) > 1:
                 log.warning("%s; left out", error)
             first = first or error
-    if not loaded:
-        raise first or DataError("nothing to evaluate")
+    if first and not loaded:
+        raise first
     return loaded
 
 
@@ -145,7 +156,7 @@ def _lift(
             address,
             lambda n: bar.advance(task, n),
         )
-    except (LiftsUnavailable, DataError) as error:
+    except DataError as error:
         log.warning("lifts on %s: %s; left out", held_out.folder, error)
         return {}
     lost = {name for name, grasps in wanted.items() if any((name, g) not in done for g in grasps)}

@@ -78,7 +78,8 @@ class Score:
 
 
 def trained_networks(folder: Path = MODELS) -> list[str]:
-    """Weights of all grasp networks in a folder, in the order of networks.GRASP_NETWORKS."""
+    """Weights of all grasp networks in a folder, in the order of networks.GRASP_NETWORKS.
+    WeightsError when there are none."""
     order = list(GRASP_NETWORKS)
     found = []
     for path in sorted(folder.glob("*.safetensors")):
@@ -88,6 +89,8 @@ def trained_networks(folder: Path = MODELS) -> list[str]:
             continue
         if network in order:
             found.append((order.index(network), path.stem))
+    if not found:
+        raise WeightsError(f"{folder}: holds no grasp network; make one with 'iwgnet train'")
     return [name if folder == MODELS else str(folder / name) for _, name in sorted(found)]
 
 
@@ -106,14 +109,14 @@ def run_network(
     for held_out in sets:
         dataset = GraspDataset(held_out.views, size)
         rows = []
-        for index in range(len(dataset)):
+        facts = zip(held_out.views.names, held_out.families, held_out.arrangements, strict=True)
+        for index, (sample, family, arrangement) in enumerate(facts):
             height, truth = dataset.crop(index)
             start = time.perf_counter()
             maps = predictor(height[None])
             seconds.append(time.perf_counter() - start)
             grasps = decode_grasps(*maps[0], max_grasps=CANDIDATES)
-            name_of, family = held_out.views.names[index], held_out.families[index]
-            rows.append(compare(name_of, family, held_out.arrangements[index], grasps, truth))
+            rows.append(compare(sample, family, arrangement, grasps, truth))
             if progress:
                 progress()
         predictions[held_out.name] = tuple(rows)
