@@ -31,7 +31,7 @@ from iwgnet_grasp.data.generate import (
 from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_jacquard
-from iwgnet_grasp.data.lift_check import plan_check, summary
+from iwgnet_grasp.data.lift_check import plan_check, require_stored, summary
 from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -216,6 +216,17 @@ def test_labels_are_lifted_and_the_agreement_is_kept(dataset):
     # Scattered and stacked rods with labels from geometry: most hold by friction.
     executed = [e for e in entries if e["outcome"] not in ("infeasible", "unreachable", "no_plan")]
     assert sum(e["outcome"] == "lifted" for e in executed) >= 0.7 * len(executed) > 0
+
+
+def test_lifts_of_labels_that_are_not_those_on_disk_are_refused(dataset):
+    lifts = json.loads((dataset / "lifts.json").read_text())
+    number, entries = next((int(n), e) for n, e in lifts.items() if e)
+    require_stored(dataset, number, entries)
+    other = {**entries[0], "quality": entries[0]["quality"] / 2}
+    with pytest.raises(DataError, match="does not come out again as it is stored"):
+        require_stored(dataset, number, [other])
+    with pytest.raises(DataError, match="does not come out again"):
+        require_stored(dataset, number, [{**entries[0], "object": 99}])
 
 
 @pytest.mark.parametrize("scenes, labels", [(1, 100), (4, 4), (200, 100), (1500, 300), (7, 1)])

@@ -55,4 +55,9 @@ def test_data_training_and_evaluation_in_three_commands(tmp_path):
         "--detector", "", "--lifts", "3", "--backend", "torch",
     )  # fmt: skip
     written = json.loads((tmp_path / "results" / "evaluation" / "evaluation.json").read_text())
-    assert "| iwgnet |" in said and "iwgnet" in json.dumps(written)
+    (network,) = written["networks"]
+    result = network["sets"]["mine"]
+    assert "| iwgnet |" in said and network["parameters"] == card["parameters"]
+    assert result["score"]["objects"] == len(samples)
+    assert 0 <= result["score"]["top1"] <= result["score"]["top5"] <= 1
+    assert result["lifts"]["tried"] == 3

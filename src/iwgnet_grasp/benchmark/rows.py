@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import tempfile
 import time
@@ -135,6 +136,59 @@ def _look(peers: bool) -> Result:
     return Result("look", value, "ms", detail, Goal(150))
 
 
+def _labels(peers: bool) -> Result:
+    from iwgnet_grasp.benchmark.labelling import measure_labelling
+
+    depth, color = measure_labelling(False), measure_labelling(True)
+    detail = (
+        f"300x300 depths, mask and grasps of an object, {depth.samples} in {depth.scenes} settled "
+        f"scenes; {color.per_second:.1f} with colour and the detector's image"
+    )
+    return Result("labels", depth.per_second, "/s and core", detail, Goal(20, at_least=True))
+
+
+@functools.cache
+def _noisy_pairs() -> dict:
+    """Ours, ViSP (a program of its own) and OpenCV on the same 200 draws of 15 noisy pairs."""
+    from iwgnet_grasp.calibration.measure import measure_pairs
+    from iwgnet_grasp.calibration.settings import CalibrationError
+
+    try:
+        return measure_pairs(200)["methods"]
+    except CalibrationError as error:
+        raise BenchmarkError(str(error)) from None
+
+
+def _hand_eye_error(peers: bool) -> Result:
+    ours, visp = (_noisy_pairs()[name] for name in ("ours, pairs", "ViSP"))
+    detail = f"15 pairs, 0.5 mm and 0.1 deg noise, 200 draws; {ours['deg']:.3f} deg"
+    return Result(
+        "hand_eye_error", ours["mm"], "mm", detail, Goal(0.75 * visp["mm"]), "ViSP", visp["mm"]
+    )
+
+
+def _hand_eye_time(peers: bool) -> Result:
+    ours, visp = (_noisy_pairs()[name] for name in ("ours, pairs", "ViSP"))
+    return Result(
+        "hand_eye_time", ours["ms"], "ms", "the same pairs", Goal(visp["ms"]), "ViSP", visp["ms"]
+    )
+
+
+def _calibration(peers: bool) -> Result:
+    from iwgnet_grasp.calibration.measure import measure_images, summary
+    from iwgnet_grasp.calibration.settings import CalibrationError
+
+    try:
+        s = summary(measure_images(range(20), "charuco"))
+    except CalibrationError as error:
+        raise BenchmarkError(str(error)) from None
+    detail = (
+        f"15 images, seeds 0-19; median {s['median_mm']:.3f} mm, {s['median_deg']:.4f} deg, worst "
+        f"{s['worst_mm']:.3f} mm, {s['worst_deg']:.4f} deg"
+    )
+    return Result("calibration", s["median_mm"], "mm", detail, Goal(0.3))
+
+
 def _trial(path: Path) -> dict:
     try:
         return json.loads((path / "trial.json").read_text())
@@ -223,8 +277,12 @@ ROWS = (
     _core_row("scene", None),
     _core_row("planning", None),
     _core_row("hand_eye", Goal(6)),
+    Row("hand_eye_error", "hand-eye error on noisy pairs against ViSP", _hand_eye_error),
+    Row("hand_eye_time", "hand-eye refinement against ViSP's time", _hand_eye_time),
+    Row("calibration", "error of whole calibrations with images, seeds 0-19", _calibration),
     Row("iwgnet", "IWGNet on one window, fastest backend", _iwgnet),
     Row("look", "detection, IWGNet and order of a pile of ten", _look),
+    Row("labels", "labelled samples from settled scenes", _labels),
     Row("trial_in_process", "a ten-object trial in one process", _trial_in_process),
     Row("trial_ros", "the five-object trial in one command", _trial_ros),
     Row("trial_ros_speed", "the five-object trial against real time", _trial_ros_speed),

@@ -45,7 +45,7 @@ from rich.progress import (
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.jacquard import format_grasps
-from iwgnet_grasp.data.lift_check import as_text, plan_check, summary
+from iwgnet_grasp.data.lift_check import as_text, plan_check, require_stored, summary
 from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
 from iwgnet_grasp.files import write_whole
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
@@ -387,7 +387,10 @@ def annotation(o: SceneObject, categories: list[str]) -> dict:
 
 def png(image: np.ndarray) -> bytes:
     """PNG of an image, BGR or grey."""
-    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    if image.ndim == 3:  # noise repeats nothing: without the search smaller and faster
+        parameters += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+    return cv2.imencode(".png", image, parameters)[1].tobytes()
 
 
 def tiff(depth: np.ndarray) -> bytes:
@@ -572,7 +575,9 @@ def _fill(
             if untried:
                 task = bar.add_task("scenes with labels lifted", total=len(untried))
             for tried in _in_piles(pool, untried, "lifts", seed, labels):
-                lifts |= {str(number): entries for number, entries in tried.items()}
+                for number, entries in tried.items():
+                    require_stored(out, number, entries)
+                    lifts[str(number)] = entries
                 write_whole(lifts_file, json.dumps(lifts).encode())
                 bar.advance(task, len(tried))
     finally:

@@ -8,10 +8,12 @@ and place (trials.lift), from the depth that the D455 measured there: just as th
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.perception.types import GraspRectangle
 from iwgnet_grasp.trials.lift import Lifter
@@ -87,6 +89,22 @@ def check_scene(lifter: Lifter, scene: Scene, labels: int, seed: list[int]) -> l
             }
         )
     return lifts
+
+
+def require_stored(out: Path, number: int, lifts: list[dict]) -> None:
+    """DataError unless the labels that were lifted are those of the scene on disk."""
+    folder = out / f"{number:06d}"
+    for lift in lifts:
+        try:
+            lines = (folder / f"{lift['object']}_{number:06d}_quality.txt").read_text().split()
+            same = abs(float(lines[lift["grasp"]]) - lift["quality"]) < 2e-4
+        except (OSError, IndexError, ValueError):
+            same = False
+        if not same:
+            raise DataError(
+                f"{folder}: does not come out again as it is stored (made by another version?); "
+                "make the set anew, or leave its labels unchecked with --lift-check 0"
+            )
 
 
 def summary(lifts: list[dict]) -> dict:
