@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -207,40 +208,51 @@ def write_plots(comparison: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def _success(comparison: dict[str, Any]) -> plt.Figure:
-    """Bars of top-1 and lifts with their 95 % intervals."""
+    """Bars of top-1, and of lifts where there are any, with their 95 % intervals."""
     networks, names = comparison["networks"], list(comparison["sets"])
+    panels = _panels(comparison)
     figure, axes = plt.subplots(
-        1, 2, figsize=(9, 3.2), sharey=True, constrained_layout=True, squeeze=True
+        1, len(panels), figsize=(4.5 * len(panels), 3.2), constrained_layout=True, squeeze=False
     )
     width = 0.8 / len(networks)
-    for axis, what in zip(axes, ("right by the rectangle metric", "lifted in Bullet"), strict=True):
+    for axis, lifts in zip(axes[0], panels, strict=True):
         for i, network in enumerate(networks):
-            for j, name in enumerate(names):
-                share, low, high = _share(network["sets"][name], axis is axes[1])
-                if share is None:
-                    continue
-                axis.bar(
-                    j + (i - (len(networks) - 1) / 2) * width,
-                    100 * share,
-                    0.9 * width,
-                    color=_COLOURS[i % len(_COLOURS)],
-                    label=network["weights"] if j == 0 else None,
-                    yerr=[[100 * max(share - low, 0)], [100 * max(high - share, 0)]],
-                    error_kw={"elinewidth": 0.8, "ecolor": "#404040"},
-                )
+            shares = [_share(network["sets"][name], lifts) for name in names]
+            at = [j + (i - (len(networks) - 1) / 2) * width for j in range(len(names))]
+            axis.bar(
+                at,
+                [100 * share for share, _, _ in shares],
+                0.9 * width,
+                color=_COLOURS[i % len(_COLOURS)],
+                label=network["weights"],
+                yerr=[
+                    [100 * (share - low) for share, low, _ in shares],
+                    [100 * (high - share) for share, _, high in shares],
+                ],
+                error_kw={"elinewidth": 0.8, "ecolor": "#404040"},
+            )
         axis.set_xticks(range(len(names)), names)
-        axis.set_title(f"First grasp {what}", fontsize=10)
+        what = "lifted in Bullet" if lifts else "right by the rectangle metric"
+        axis.set_title(f"First grasp {what}, % of the objects", fontsize=10)
         axis.grid(axis="y", linewidth=0.4)
         axis.set_axisbelow(True)
         axis.set_ylim(0, 100)
-    axes[0].set_ylabel("% of the objects")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncol=len(networks), fontsize=8)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncol=3, fontsize=8)
     return figure
 
 
-def _share(on_set: dict[str, Any], lifts: bool) -> tuple[float | None, float, float]:
+def _panels(comparison: dict[str, Any]) -> tuple[bool, ...]:
+    """Whether a plot's panels show lifts."""
+    lifts = any(s["lifts"]["tried"] for n in comparison["networks"] for s in n["sets"].values())
+    return (False, True) if lifts else (False,)
+
+
+def _share(on_set: dict[str, Any], lifts: bool) -> tuple[float, float, float]:
+    """Share and the ends of its interval; NaN where nothing was lifted."""
     if lifts:
+        if not on_set["lifts"]["tried"]:
+            return math.nan, math.nan, math.nan
         return on_set["lifts"]["share"], *on_set["lifts"]["interval_95"]
     score = on_set["score"]
     right = round(score["top1"] * score["objects"])
@@ -249,9 +261,11 @@ def _share(on_set: dict[str, Any], lifts: bool) -> tuple[float | None, float, fl
 
 def _quality(comparison: dict[str, Any]) -> plt.Figure:
     """Reliability diagrams over all sets: predicted quality against labels and against lifts."""
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.9), constrained_layout=True)
-    titles = "quality of the label that was hit", "share of the grasps that lifted"
-    for axis, title, lifts in zip(axes, titles, (False, True), strict=True):
+    panels = _panels(comparison)
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(4.5 * len(panels), 3.9), constrained_layout=True, squeeze=False
+    )
+    for axis, lifts in zip(axes[0], panels, strict=True):
         axis.plot([0, 1], [0, 1], color="#909090", linewidth=0.8)
         for i, network in enumerate(comparison["networks"]):
             bins = _pooled(network, lifts)
@@ -264,10 +278,12 @@ def _quality(comparison: dict[str, Any]) -> plt.Figure:
         axis.set_xlim(0, 1)
         axis.set_ylim(0, 1)
         axis.set_xlabel("predicted quality of the first grasp")
-        axis.set_ylabel(title)
+        axis.set_ylabel(
+            "share of the grasps that lifted" if lifts else "quality of the label that was hit"
+        )
         axis.grid(linewidth=0.4)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncol=len(labels), fontsize=8)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncol=3, fontsize=8)
     return figure
 
 
