@@ -18,6 +18,7 @@ from iwgnet_grasp.data.detection import (
     collate,
     load_detection_set,
     outline,
+    overlapping,
 )
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.letterbox import checked_region, letterbox
@@ -181,6 +182,15 @@ def test_collate_gives_centres_and_sizes_with_the_image_index():
     assert targets[:, 0].tolist() == [0, 0, 1, 1]
     x1, y1, x2, y2 = scene(1).boxes[0].tolist()
     assert targets[2, 2:].tolist() == [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1]
+
+
+def test_parts_of_piles_are_looked_at_more_often():
+    boxes = np.array([[0, 0, 40, 40], [30, 30, 60, 60], [38, 10, 70, 35], [80, 80, 90, 90]], float)
+    assert overlapping(boxes).tolist() == [2, 2, 2, 0]
+    pile = replace(scene(0), boxes=boxes.astype(np.float32), labels=np.zeros(4, np.int64))
+    windows = DetectionWindows([scene(1), pile], 4, (64, 64), 1.0, 0, 0)
+    times = [windows.objects.count(entry) for entry in ((0, 0), (1, 0), (1, 3))]
+    assert times == [1, 3, 1]
 
 
 def write_coco(folder, count=4):

@@ -198,8 +198,14 @@ class DetectionWindows(Dataset):
         self.zoom = zoom
         self.seed = (seed, epoch)
         self.augmentation = augmentation or Augmentation()
-        # Full tables are looked at more often: one entry an object.
-        self.objects = [(i, k) for i, scene in enumerate(scenes) for k in range(len(scene.boxes))]
+        # Piles are what is hard: an object is looked at once for itself and once for each
+        # neighbour whose box overlaps its own.
+        self.objects = [
+            (i, k)
+            for i, scene in enumerate(scenes)
+            for k, count in enumerate(overlapping(scene.boxes))
+            for _ in range(1 + count)
+        ]
 
     def __len__(self) -> int:
         return self.count
@@ -266,6 +272,13 @@ class DetectionWindows(Dataset):
                 boxes.append([*low, *high])
                 labels.append(label)
         return np.array(boxes, np.float32).reshape(-1, 4), np.array(labels, np.int64)
+
+
+def overlapping(boxes: np.ndarray) -> np.ndarray:
+    """How many of the other corner boxes (N, 4) overlap each one -> (N,)."""
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    return (high > low).all(-1).sum(1) - 1
 
 
 def recolour(image: np.ndarray, change: Augmentation, rng: np.random.Generator) -> np.ndarray:
