@@ -25,8 +25,8 @@ def connect(address: str | None, workers: int) -> Any:
 
     quiet = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
-        # The dashboard and its agents would cost more memory than a worker.
-        ray.init(num_cpus=workers, include_dashboard=False, **quiet)
+        # "local": not one that happens to run here. The dashboard would cost as much as a worker.
+        ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
         return ray
     if address != "auto":
         _knock(address)

@@ -21,6 +21,7 @@ def record(picks, scene="ten_stacked", seed=0, objects=None, **more):
     record = {
         "scene": scene,
         "seed": seed,
+        "transport": "in_process",
         "success": good == len(picks) == objects,
         "objects": objects,
         "in_tray": good,
@@ -89,6 +90,13 @@ def test_a_summary_counts_trials_attempts_objects_and_hours():
     assert s["failed_trials_by_cause"] == {"dropped": 1}
     assert s["failed_seeds"] == {"2": ["dropped"]}
     assert s["slip_mm"] == {"median": 0.2, "p95": 0.2, "max": 0.2}
+
+
+def test_computation_costs_picks_only_where_the_cells_clock_stood_still_meanwhile():
+    # 2 picks in 8 s on the cell's clock and 1 s of computing.
+    assert summarise([record([pick()] * 2)])["picks_per_hour"] == pytest.approx(2 * 3600 / 9)
+    over_ros = summarise([record([pick()] * 2, transport="ros")])
+    assert over_ros["picks_per_hour"] == pytest.approx(2 * 3600 / 8)
 
 
 def test_the_average_is_over_scenes_as_in_the_paper():

@@ -113,6 +113,8 @@ class RosWorker(_Configured):
         out = self._log_dir / f"{scene}_{seed}"
         command = [sys.executable, "-m", "iwgnet_grasp.ros.grasping"]
         command += ["--scene", scene, "--seed", str(seed), "--replan", self._conditions.replan]
+        command += ["--driver", "simulation", "--real-time", "false"]
+        command += ["--rviz", "false", "--record", "false"]
         command += ["--camera-offset", str(self._conditions.camera_offset)]
         command += ["--config-dir", str(self._config_dir), "--out", str(out), "--no-pictures"]
         if self._conditions.calibration:
