@@ -203,6 +203,32 @@ def test_an_address_without_a_cluster_is_one_line(tmp_path):
     assert len(said.strip().splitlines()) == 1 and f"nobody answers at {address}" in said
 
 
+RAY_HEAD = """
+import ray, sys
+ray.init(num_cpus=1, include_dashboard=False)
+print(ray.get_runtime_context().gcs_address, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_ray_cluster_makes_the_same_set(dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    head = subprocess.Popen(
+        [sys.executable, "-c", RAY_HEAD],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        run = command(tmp_path, "--address", head.stdout.readline().strip())
+        _, said = run.communicate(timeout=300)
+    finally:
+        head.communicate("")
+    assert run.returncode == 0, said
+    assert_same_set(tmp_path, dataset)
+
+
 def test_labels_are_lifted_and_the_agreement_is_kept(dataset):
     lifts = json.loads((dataset / "lifts.json").read_text())
     entries = [entry for scene in lifts.values() for entry in scene]
