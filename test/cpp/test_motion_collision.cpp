@@ -154,6 +154,18 @@ TEST(CollisionWorld, AHeldPartReachesFartherThanTheGripper) {
   EXPECT_FALSE(world.collides(beside));
 }
 
+TEST(CollisionWorld, EachPieceOfWhatIsHeldCounts) {
+  CollisionWorld world(cell());
+  world.set_gripper_gap(0.006);
+  const JointVector q = tool_down(0.5, 0.0, 0.30);
+  const motion::AttachedPart near{{0, -0.05, 0.02}, {0, 0.05, 0.02}, 0.02};
+  const motion::AttachedPart low{{0, -0.05, 0.29}, {0, 0.05, 0.29}, 0.02};
+  world.set_attached(std::vector{near});
+  EXPECT_EQ(world.describe(q), "");
+  world.set_attached(std::vector{near, low});
+  EXPECT_EQ(world.describe(q), "held_part - table");
+}
+
 // Every vertex of the URDF's collision meshes lies in a sphere, but for 4 mm.
 TEST(CollisionWorld, SpheresCoverTheRobotsMeshes) {
   const std::string robot = kSource + "/assets/robot/";

@@ -179,6 +179,31 @@ TEST(Color, AlbedoAndHueReachTheImage) {
   EXPECT_LT(dark[0], 0.5 * red[0]);
 }
 
+// Left half black, right half white, seen straight on under light without shadow: the edge lies where
+// the print has it to a fraction of a pixel, wherever the sheet is.
+TEST(Color, APrintsEdgeFallsBetweenPixelsWhereItBelongs) {
+  Scene scene;
+  cv::Mat print(100, 200, CV_8UC1, cv::Scalar(0));
+  print.colRange(100, 200).setTo(255);
+  const int sheet = scene.renderer.add_instance(scene.renderer.add_sheet({0.4, 0.2}, print),
+                                                {{0, 0, 0}, 0, 1, 0}, Pose::Identity());
+  scene.light.ambient = 1.0f;
+  for (const double x : {0.0, 0.0013, 0.0029}) {
+    scene.renderer.set_pose(sheet, at(x, 0, 0.05));
+    const cv::Mat image = scene.renderer.color(kCamera, scene.T_base_camera, scene.light, 0, 0);
+    const Eigen::Vector3d edge = scene.T_base_camera.inverse() * Eigen::Vector3d(x, 0, 0.05);
+    const double expected = project(kCamera, edge).x();
+    // Linear light again, the transition's share of black tells where it lies.
+    const int from = cvFloor(expected) - 8, to = cvFloor(expected) + 9;
+    const auto light = [&](int u) { return std::pow(image.at<cv::Vec3b>(120, u)[1] / 255.0, 2.2); };
+    const double black = light(from), white = light(to);
+    double dark = 0;
+    for (int u = from; u <= to; ++u) dark += (white - light(u)) / (white - black);
+    EXPECT_NEAR(from - 0.5 + dark, expected, 0.15) << x;
+    EXPECT_GT(white, 3 * black);
+  }
+}
+
 TEST(Renderer, BadInputIsRefused) {
   Renderer renderer;
   EXPECT_THROW(renderer.add_mesh({}), Error);
@@ -189,6 +214,9 @@ TEST(Renderer, BadInputIsRefused) {
   EXPECT_THROW(renderer.add_instance(0, {}, Pose::Identity()), Error);
   EXPECT_THROW(renderer.set_pose(3, Pose::Identity()), Error);
   EXPECT_THROW(renderer.depth({}, Pose::Identity()), Error);
+  EXPECT_THROW(renderer.add_sheet({0.1, 0.1}, cv::Mat()), Error);
+  EXPECT_THROW(renderer.add_sheet({0.1, 0.0}, cv::Mat(4, 4, CV_8UC1)), Error);
+  EXPECT_THROW(renderer.add_sheet({0.1, 0.1}, cv::Mat(4, 4, CV_8UC3)), Error);
 }
 
 }  // namespace

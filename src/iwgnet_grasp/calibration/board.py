@@ -138,8 +138,8 @@ class Board:
 
 
 def _refined(gray: np.ndarray, pixels: np.ndarray, side_px: float) -> np.ndarray:
-    """Corners to a fraction of a pixel. Done here for both boards: what OpenCV 4.6 says of a ChArUco
-    board's corners is half a pixel too far to the right and down.
+    """Corners to a fraction of a pixel. Done here for both boards: what OpenCV 4.6 says of a
+    ChArUco board's corners is half a pixel too far to the right and down.
     """
     half = int(np.clip(_REFINE * side_px, *_REFINE_PX))
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)

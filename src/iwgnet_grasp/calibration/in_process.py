@@ -17,7 +17,7 @@ from iwgnet_grasp.calibration.settings import PACKAGE, Settings, core
 
 
 class InProcessCell:
-    """routine.Cell. The camera hangs off its nominal pose and the rig is mounted as `seed` draws."""
+    """routine.Cell. Camera and rig hang off their nominal poses as `seed` draws."""
 
     def __init__(self, settings: Settings, board: Board, seed: int, package_dir: Path = PACKAGE):
         self._core = core()

@@ -23,6 +23,7 @@ _DRAWS = 6000  # of board poses, at most
 _CANDIDATES = 12  # usable poses to choose from, for each pose wanted
 # What counts as far apart: poses differ by 1 along each of these.
 _FAR_MOVE, _FAR_TURN, _FAR_TILT = 0.10, 0.8, 0.35  # m, rad, rad
+_TURNING = np.array([1, 1, 0, 1, 1, 1])  # joints with more than one turn
 _PIECES = 5  # capsules that cover the plate in collision checks
 _OBSERVED = 5  # points a side of the print that nothing may hide
 
@@ -111,8 +112,9 @@ class PosePlanner:
             return None
         start = s.start_joints
         for q in self._core.inverse(T @ inverse(s.T_tool_board)):
-            q = q + 2 * np.pi * np.round((start - q) / (2 * np.pi))
-            q = np.where(np.abs(q) > 2 * np.pi, q - 2 * np.pi * np.sign(q), q)
+            # The turn nearest to the start, but for the elbow, which has only one.
+            turns = np.round((start - q) / (2 * np.pi)) * _TURNING
+            q = q + 2 * np.pi * turns
             if not self.world.collides(q) and not self._hidden(points, q):
                 return View(q, T)
         return None

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from iwgnet_grasp.calibration.samples import SampleSet
-from iwgnet_grasp.calibration.settings import core, difference, inverse
+from iwgnet_grasp.calibration.settings import as_yaml, core, difference, inverse
 from iwgnet_grasp.calibration.solve import Calibration, Method
 
 _MM = 1e3
@@ -37,8 +37,9 @@ def text(calibration: Calibration, samples: SampleSet) -> list[str]:
     for i, weight in enumerate(c.weights):
         px = f"   {c.view_rms_px[i]:5.3f}" if images else ""
         lines.append(
-            f"{i + 1:4d}   {c.translation_residuals[i] * _MM:11.3f}  {d(c.rotation_residuals[i]):5.3f}"
-            f"{px}   {weight:6.2f}{'   OUTLIER, left out' if weight < 0.1 else ''}"
+            f"{i + 1:4d}   {c.translation_residuals[i] * _MM:11.3f}  "
+            f"{d(c.rotation_residuals[i]):5.3f}{px}   {weight:6.2f}"
+            + ("   OUTLIER, left out" if weight < 0.1 else "")
         )
     if images:
         lines.append(f"corners: RMS {c.rms_px:.3f} px of one coordinate, over all images")
@@ -66,9 +67,8 @@ def methods_table(
         move, turn = core().axxb_rms(
             samples.T_base_tool, samples.T_camera_target, method.T_base_camera
         )
-        line = (
-            f"{method.name:18s} {move * _MM:9.3f} {np.degrees(turn):7.4f} {method.milliseconds:8.2f}"
-        )
+        line = f"{method.name:18s} {move * _MM:9.3f} {np.degrees(turn):7.4f}"
+        line += f" {method.milliseconds:8.2f}"
         if truth is not None:
             move, turn = difference(method.T_base_camera, truth)
             line += f" {move * _MM:9.3f} {np.degrees(turn):7.4f}"
@@ -77,9 +77,11 @@ def methods_table(
 
 
 def as_dict(calibration: Calibration) -> dict[str, Any]:
-    """Plain values for a file."""
+    """Plain values for a file; T_base_color is what camera_pose reads."""
     c = calibration
     return {
+        "T_base_color": as_yaml(c.T_base_camera),
+        "T_tool_target": as_yaml(c.T_tool_target),
         "method": c.method,
         "residuals": {
             "translation": [round(float(v), 9) for v in c.translation_residuals],

@@ -93,7 +93,10 @@ def collect(
             continue
         samples.append(sample)
         say(_line(len(samples), count, sample, board))
-    cell.move(planner.motion(here, start))
+    try:
+        cell.move(planner.motion(here, start))
+    except CalibrationError as error:
+        say(f"the arm stays at its last pose: {error}")
     noise = settings.noise if source == "images" else settings.simulated_noise
     return SampleSet(samples, intrinsics, noise, {**origin, "source": source})
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
-from iwgnet_grasp.calibration.settings import CalibrationError, as_yaml, core, inverse, matrix
+from iwgnet_grasp.calibration.settings import CalibrationError, as_yaml, core, matrix
 from iwgnet_grasp.networks.weights import write_whole
 
 
@@ -130,39 +131,26 @@ def simulated(
     transform and with this noise of the target poses (per axis: m, rad). Returns them and the true
     T_base_camera.
     """
+
+    def pose(move: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, :3] = cv2.Rodrigues(turn)[0]
+        T[:3, 3] = move
+        return T
+
+    def uniform(*limits: float) -> np.ndarray:
+        return random.uniform(-1.0, 1.0, 3) * limits
+
     T_base_camera = np.diag([1.0, -1.0, -1.0, 1.0])
     T_base_camera[:3, 3] = 0.5, 0.0, 0.6
-    T_base_camera = T_base_camera @ _small(random.uniform(-1, 1, 3) * 0.01, random, 0.03)
-    T_tool_target = _small(np.array([0.0, 0.0, 0.25]) + random.uniform(-1, 1, 3) * 0.02, random, 0.5)
+    T_base_camera = T_base_camera @ pose(uniform(0.01, 0.01, 0.01), uniform(0.03, 0.03, 0.03))
+    T_tool_target = pose(uniform(0.02, 0.02, 0.02) + [0, 0, 0.25], uniform(0.5, 0.5, 0.5))
     samples = []
     for _ in range(count):
-        T_base_tool = T_base_camera @ _small(
-            np.array([random.uniform(-0.15, 0.15), random.uniform(-0.12, 0.12), 0.30])
-            + random.uniform(-0.08, 0.08, 3),
-            random,
-            0.0,
-        )
-        tilt = random.uniform(-0.5, 0.5, 2)
-        T_base_tool[:3, :3] = T_base_camera[:3, :3] @ _turn(
-            np.array([tilt[0], tilt[1], random.uniform(-1.0, 1.0)])
-        )
-        T_camera_target = inverse(T_base_camera) @ T_base_tool @ T_tool_target
-        error = np.eye(4)
-        error[:3, :3] = _turn(random.normal(0.0, noise[1], 3))
-        error[:3, 3] = random.normal(0.0, noise[0], 3)
-        samples.append(Sample(np.zeros(6), T_base_tool, T_camera_target @ error))
+        # Seen from the camera: below it, tilted up to 30 deg, turned up to 1 rad.
+        T_camera_tool = pose(uniform(0.15, 0.12, 0.08) + [0, 0, 0.3], uniform(0.5, 0.5, 1.0))
+        T_camera_target = T_camera_tool @ T_tool_target
+        error = pose(random.normal(0.0, noise[0], 3), random.normal(0.0, noise[1], 3))
+        samples.append(Sample(np.zeros(6), T_base_camera @ T_camera_tool, T_camera_target @ error))
     intrinsics = (1280, 800, 640.0, 640.0, 639.5, 399.5)
     return SampleSet(samples, intrinsics, noise, {"source": "draw"}), T_base_camera
-
-
-def _small(move: np.ndarray, random: np.random.Generator, turn: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = _turn(random.uniform(-turn, turn, 3))
-    T[:3, 3] = move
-    return T
-
-
-def _turn(vector: np.ndarray) -> np.ndarray:
-    import cv2
-
-    return cv2.Rodrigues(np.asarray(vector, float))[0]

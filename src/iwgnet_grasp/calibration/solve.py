@@ -114,7 +114,9 @@ def solve_with_visp(problems: Sequence[SampleSet]) -> list[tuple[np.ndarray | st
     for problem in problems:
         lines.append(str(len(problem.samples)))
         for sample in problem.samples:
-            numbers = np.concatenate([sample.T_base_tool[:3].ravel(), sample.T_camera_target[:3].ravel()])
+            numbers = np.concatenate(
+                [sample.T_base_tool[:3].ravel(), sample.T_camera_target[:3].ravel()]
+            )
             lines.append(" ".join(f"{number:.17g}" for number in numbers))
     try:
         run = subprocess.run(
@@ -144,27 +146,23 @@ class Method:
     milliseconds: float
 
 
-def compare(samples: SampleSet) -> list[Method]:
-    """T_base_camera of the same samples by ViSP, ours, OpenCV's five hand-eye and two robot-world
-    methods.
+def compare(samples: SampleSet, visp: tuple[np.ndarray | str, float] | None = None) -> list[Method]:
+    """T_base_camera of the same samples by ViSP (made here unless given), ours, OpenCV's five
+    hand-eye and two robot-world methods.
     """
     _core = core()
-    solution, milliseconds = solve_with_visp([samples])[0]
+    solution, milliseconds = visp or solve_with_visp([samples])[0]
     T_visp = None if isinstance(solution, str) else solution
     methods = [Method("ViSP", T_visp, milliseconds)]
     if T_visp is not None:
         noise = _core.PoseNoise(*samples.noise)
         poses = samples.T_base_tool, samples.T_camera_target
-        methods.append(
-            _timed("ours, pairs", lambda: _core.refine_hand_eye(*poses, T_visp, noise))
-        )
+        methods.append(_timed("ours, pairs", lambda: _core.refine_hand_eye(*poses, T_visp, noise)))
         if samples.has_images:
             views, camera = samples.views, samples.camera
             Y = _core.mean_tool_target(*poses, T_visp)
             methods.append(
-                _timed(
-                    "ours, images", lambda: _core.refine_reprojection(views, camera, T_visp, Y)
-                )
+                _timed("ours, images", lambda: _core.refine_reprojection(views, camera, T_visp, Y))
             )
     for name in _OPENCV_HAND_EYE:
         methods.append(_timed(f"OpenCV {name}", lambda name=name: _hand_eye(samples, name)))
@@ -203,7 +201,8 @@ def _hand_eye(samples: SampleSet, name: str) -> np.ndarray:
 
 
 def _robot_world(samples: SampleSet, name: str) -> np.ndarray:
-    """cv2.calibrateRobotWorldHandEye solves T_cam_world T_world_base = T_cam_gripper T_gripper_base.
+    """cv2.calibrateRobotWorldHandEye: T_cam_world T_world_base = T_cam_gripper T_gripper_base.
+
     Ours, T_camera_target T_target_tool = T_camera_base T_base_tool, has the same form.
     """
     _, _, R_camera_base, t_camera_base = cv2.calibrateRobotWorldHandEye(

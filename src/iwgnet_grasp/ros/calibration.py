@@ -31,7 +31,6 @@ from iwgnet_grasp.calibration.settings import (
     PACKAGE,
     CalibrationError,
     Settings,
-    as_yaml,
     difference,
     load_settings,
 )
@@ -127,7 +126,7 @@ class RosCell:
             newest = self._state()[0]
             if newest - start > s.settle_give_up:
                 return True
-            recent = [state for state in list(self._states) if state[0] >= newest - s.settle_time]
+            recent = self._states_since(newest - s.settle_time)
             quiet = all(np.abs(qd).max() <= s.settle_speed for _, _, qd in recent)
             return newest - start >= s.settle_time and quiet
 
@@ -147,8 +146,10 @@ class RosCell:
         )
         message = self._next(topic, kind, before[0])
         stamp = message.header.stamp.to_sec()
-        self._wait(lambda: self._state()[0] >= stamp, _WAIT, lambda: "no joint state after the image")
-        states = [state for state in list(self._states) if state[0] >= before[0]]
+        self._wait(
+            lambda: self._state()[0] >= stamp, _WAIT, lambda: "no joint state after the image"
+        )
+        states = self._states_since(before[0])
         moved = max(np.abs(q - before[1]).max() for _, q, _ in states)
         if moved > self._settings.max_motion:
             raise DetectionError(f"the arm moved by {moved:.1e} rad while the image was taken")
@@ -158,7 +159,9 @@ class RosCell:
             from iwgnet_grasp.ros.messages import image_array
 
             return Look(joints, np.array(image_array(message, topic)))
-        return Look(joints, T_camera_target=_matrix(message.pose.position, message.pose.orientation))
+        return Look(
+            joints, T_camera_target=_matrix(message.pose.position, message.pose.orientation)
+        )
 
     def intrinsics(self) -> tuple[int, int, float, float, float, float]:
         from sensor_msgs.msg import CameraInfo
@@ -258,14 +261,19 @@ class RosCell:
     def _state(self) -> tuple[float, np.ndarray, np.ndarray]:
         return self._states[-1]
 
+    def _states_since(self, stamp: float) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        with self._changed:  # rospy's thread adds to them
+            return [state for state in self._states if state[0] >= stamp]
+
     def _on_joints(self, message: Any) -> None:
         if not set(self._names) <= set(message.name):
             return  # the gripper's
         order = [message.name.index(name) for name in self._names]
         q = np.array([message.position[i] for i in order])
         qd = np.array([message.velocity[i] for i in order])
-        self._states.append((message.header.stamp.to_sec(), q, qd))
-        self._notify()
+        with self._changed:
+            self._states.append((message.header.stamp.to_sec(), q, qd))
+            self._changed.notify_all()
 
     def _on_result(self, message: Any) -> None:
         self._result = message
@@ -368,7 +376,10 @@ def _markers(topics: Any, calibration: Calibration, samples: SampleSet, outline:
     width, height, fx, fy, cx, cy = samples.intrinsics
     far = 0.25  # m, how much of the camera's view is drawn
     corners = np.array(
-        [[(u - cx) / fx, (v - cy) / fy, 1.0] for u, v in ((0, 0), (width, 0), (width, height), (0, height))]
+        [
+            [(u - cx) / fx, (v - cy) / fy, 1.0]
+            for u, v in ((0, 0), (width, 0), (width, height), (0, height))
+        ]
     )
     corners = place(calibration.T_base_camera, far * corners)
     view = []
@@ -432,15 +443,7 @@ def _on_graph(
         _say("")
         for line in report.methods_table(compare(samples), samples, truth):
             _say(line)
-        save(
-            options.out,
-            samples,
-            {
-                "T_base_color": as_yaml(calibration.T_base_camera),
-                "T_tool_target": as_yaml(calibration.T_tool_target),
-                **report.as_dict(calibration),
-            },
-        )
+        save(options.out, samples, report.as_dict(calibration))
         _say("")
         _say(f"{rospy.get_time() - started:.0f} s on the cell's clock; wrote {options.out}")
         if samples.has_images:
