@@ -12,6 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
+import rosbag
+from iwgnet_grasp.msg import Topics
 
 from iwgnet_grasp.ros.session import free_master_uri
 
@@ -107,7 +109,7 @@ def assert_all_gone(nodes: dict[str, int]) -> None:
 
 
 def test_a_whole_trial_clears_the_table_and_leaves_its_results(tmp_path):
-    trial = Trial(tmp_path, replan="once")
+    trial = Trial(tmp_path, replan="once", record="true")
     trial.wait_for_line("^pick  1")
     nodes = trial.nodes()
     code, text, record = trial.finish()
@@ -119,6 +121,12 @@ def test_a_whole_trial_clears_the_table_and_leaves_its_results(tmp_path):
     for name in ("scene", "boxes", "merged_depth", "grasps"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert_all_gone(nodes)
+    with rosbag.Bag(str(tmp_path / "trial.bag")) as bag:
+        topics = bag.get_type_and_topic_info().topics
+    numbered = [Topics.SCENE, Topics.GRASPS, Topics.GRASP_POSE, Topics.GRIPPER_WIDTH]
+    numbered += [f"{action}/goal" for action in (Topics.ARM_ACTION, Topics.GRIPPER_ACTION)]
+    for topic in (*numbered, Topics.JOINT_STATES, "/tf", "/tf_static"):
+        assert topic in topics and topics[topic].message_count >= 1, topic
 
 
 def test_a_node_killed_in_mid_trial_ends_it_with_a_line_and_a_result(tmp_path):
