@@ -16,9 +16,10 @@ from iwgnet_grasp.data.labels import label_maps
 from iwgnet_grasp.networks import create_network
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
-from iwgnet_grasp.networks.weights import WeightsError, save_weights
+from iwgnet_grasp.networks.weights import MODELS, WeightsError, save_weights
 from iwgnet_grasp.report.learning import as_markdown, write_report
 from iwgnet_grasp.training.comparison import compare_networks, lift_score
+from iwgnet_grasp.training.detector_evaluation import evaluate_detector
 from iwgnet_grasp.training.evaluation import compare, score, score_by, trained_networks
 from iwgnet_grasp.training.held_out import load_held_out
 from iwgnet_grasp.training.rectangle_metric import hit
@@ -200,6 +201,23 @@ def test_a_set_tells_family_and_arrangement_of_its_objects(rods):
     assert set(held_out.families) == {"connecting_rod"}
     assert set(held_out.arrangements) <= {"scattered", "stacked"}
     assert len(load_held_out(rods, limit=2).views) == 2
+
+
+def test_the_shipped_detector_finds_the_rods(rods, tmp_path):
+    data = tmp_path / "rods"
+    shutil.copytree(rods / "detector", data / "detector")
+    weights = MODELS / "yolov5s.safetensors"
+    whole = evaluate_detector(weights, data)
+    assert (whole["scenes"], whole["left_out"]) == (LOOKS, [])
+    assert 0.5 < whole["map50_95"] <= whole["map50"] and whole["map50"] > 0.9
+    assert sum(part["scenes"] for part in whole["arrangements"].values()) == LOOKS
+    broken = data / "detector" / "images" / "000001.png"
+    broken.write_bytes(broken.read_bytes()[:100])
+    rest = evaluate_detector(weights, data)
+    assert (rest["scenes"], rest["left_out"]) == (LOOKS - 1, [broken])
+    (data / "detector" / "annotations.json").write_text("[]")
+    with pytest.raises(DataError, match="not COCO annotations"):
+        evaluate_detector(weights, data)
 
 
 def test_lifts_tell_good_grasps_from_bad_ones_and_are_not_repeated(rods, tmp_path):

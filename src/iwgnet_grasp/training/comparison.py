@@ -90,7 +90,7 @@ def compare_networks(
             held_out.name: _lift(held_out, runs, lifts, seed, out, workers, address, bar)
             for held_out in sets
         }
-        found = _detect(detector, sets, bar) if detector else {}
+        found = _detect(detector, sets, backend, bar) if detector else {}
     return {
         "sets": {s.name: _describe(s) for s in sets},
         "lifts": {"count": lifts, "seed": seed},
@@ -178,7 +178,9 @@ def _lift(
     }
 
 
-def _detect(weights: Path, sets: Sequence[HeldOutSet], bar: Progress) -> dict[str, Any]:
+def _detect(
+    weights: Path, sets: Sequence[HeldOutSet], backend: str, bar: Progress
+) -> dict[str, Any]:
     from iwgnet_grasp.training.detector_evaluation import evaluate_detector
 
     found = {}
@@ -187,7 +189,9 @@ def _detect(weights: Path, sets: Sequence[HeldOutSet], bar: Progress) -> dict[st
             continue
         task = bar.add_task(f"detector on {held_out.name}", total=None)
         try:
-            metrics = evaluate_detector(weights, held_out.folder, lambda t=task: bar.advance(t))
+            metrics = evaluate_detector(
+                weights, held_out.folder, backend, lambda t=task: bar.advance(t)
+            )
         except (PerceptionError, DataError) as error:
             log.warning("detector: %s; left out", error)
             continue

@@ -20,7 +20,10 @@ MAX_OBJECTS = 100
 
 
 def evaluate_detector(
-    weights: Path, folder: Path, progress: Callable[[], None] | None = None
+    weights: Path,
+    folder: Path,
+    backend: str = "auto",
+    progress: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Metrics of average_precision(), of all scenes and by arrangement, and the latency.
 
@@ -29,7 +32,9 @@ def evaluate_detector(
     read. Raises PerceptionError for weights, DataError for a set without annotations.
     """
     scenes = _scenes(folder / "detector" / "annotations.json")
-    detector = Detector(weights, score_threshold=SCORE_THRESHOLD, max_objects=MAX_OBJECTS)
+    detector = Detector(
+        weights, score_threshold=SCORE_THRESHOLD, max_objects=MAX_OBJECTS, backend=backend
+    )
     truth, found, arrangements, seconds, left_out = [], [], [], [], []
     for file, arrangement, boxes in scenes:
         if progress:
