@@ -1,7 +1,16 @@
 """Files on disk."""
 
+import errno
 import os
 from pathlib import Path
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def disk_error(error: OSError, place: Path, afterwards: str) -> str:
+    """One line: which file or place, why, and what to do when the disk is full."""
+    said = f"{error.filename or place}: {error.strerror or error}"
+    return f"{said}; make room, then {afterwards}" if error.errno in NO_ROOM else said
 
 
 def write_whole(path: Path, content: bytes) -> None:

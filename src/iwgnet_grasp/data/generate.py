@@ -4,6 +4,7 @@
     OUT/<scene %06d>/<object>_<scene>_...  one crop an object, in Jacquard's layout (data.jacquard)
     OUT/detector/images/<scene>.png        the colour image
     OUT/detector/annotations.json          COCO: boxes and run-length masks
+    OUT/lifts.json                         labels carried out in Bullet (data.lift_check)
 
 Both depths of a crop are the merged depth of the paper (section 4.2): the object's box pasted into
 the depth of the empty table, once noise-free (perfect) and once as the D455 measures it (stereo).
@@ -47,7 +48,7 @@ from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, TH
 from iwgnet_grasp.data.jacquard import format_grasps
 from iwgnet_grasp.data.lift_check import as_text, plan_check, require_stored, summary
 from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
-from iwgnet_grasp.files import write_whole
+from iwgnet_grasp.files import disk_error, write_whole
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
 from iwgnet_grasp.perception.types import Box, Window
@@ -525,10 +526,8 @@ def generate_dataset(
                     shutil.rmtree(rest, ignore_errors=True)
                 counts = write_annotations(out, categories, detector)
     except OSError as error:
-        raise DataError(
-            f"{error.filename or out}: {error.strerror or error}; make room, then run the same "
-            "command again to go on"
-        ) from None
+        again = "run the same command again to go on"
+        raise DataError(disk_error(error, out, again)) from None
     return counts
 
 

@@ -20,7 +20,7 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_dataset import GraspDataset, Views, find_samples, load_views
 from iwgnet_grasp.data.sample import image_wise_split, object_wise_split
-from iwgnet_grasp.files import write_whole
+from iwgnet_grasp.files import disk_error, write_whole
 from iwgnet_grasp.networks import count_parameters, create_network
 from iwgnet_grasp.networks.decode import decode_grasps
 from iwgnet_grasp.networks.weights import (
@@ -314,8 +314,6 @@ def train_grasp_network(
         raise KeyboardInterrupt from None
     except OSError as error:
         again = "run it again with --resume" if last.is_file() else "run it again"
-        raise DataError(
-            f"{error.filename or folder}: {error.strerror or error}; make room, then {again}"
-        ) from None
+        raise DataError(disk_error(error, folder, again)) from None
     load_weights(weights)  # what was written can be read
     return weights
