@@ -215,6 +215,51 @@ def dataset(context: typer.Context) -> None:
     _forward(context, generate.generate, "dataset")
 
 
+@app.command("export")
+def export(
+    weights: Annotated[
+        str, typer.Option(help="Name in models/ or path, of a grasp network or the detector.")
+    ] = "iwgnet",
+    format_: Annotated[
+        str, typer.Option("--format", help="onnx, openvino, tensorrt or all that are installed.")
+    ] = "all",
+    size: Annotated[
+        int | None,
+        typer.Option(min=32, help="Edge of a grasp network's input, px; by default its card's."),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("results/export"),
+    precision: Annotated[
+        str | None,
+        typer.Option(
+            help="fp32, bf16, fp16 or int8: what a TensorRT engine may compute in (by default "
+            "fp16); fp16 also halves the file of OpenVINO. ONNX is always fp32."
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of 'iwgnet dataset': calibrates int8 and is compared as well."),
+    ] = None,
+) -> None:
+    """Write weights as ONNX, OpenVINO and TensorRT files for other programs.
+
+    Each file is run and compared with torch in float32; one that differs is not written. Example:
+    iwgnet export --weights iwgnet --size 300
+    """
+    from iwgnet_grasp.networks.export import PRECISIONS
+    from iwgnet_grasp.networks.export import export as write
+
+    formats = list(PRECISIONS) if format_ == "all" else [format_]
+    written, left_out = write(weights, formats, out, size, precision, data)
+    for file in written:
+        typer.echo(
+            f"wrote {out / file.file} ({file.precision}): differs from torch by at most "
+            f"{file.largest_difference:.1e}, on average {file.mean_difference:.1e} "
+            f"({file.inputs_compared} inputs)"
+        )
+    for line in left_out:
+        typer.echo(f"left out {line}", err=True)
+
+
 @app.command("calibrate", context_settings=_FORWARD)
 def calibrate(context: typer.Context) -> None:
     """Solve a camera calibration again from its file; options: iwgnet calibrate --help."""

@@ -1,6 +1,6 @@
 """Measures the project's figures and prints them beside their goals and peers.
 
-    scripts/benchmark [--only NAME ...] [--peers] [--json FILE]
+scripts/benchmark [--only NAME ...] [--peers] [--json FILE]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from iwgnet_grasp.benchmark.measure import BenchmarkError
-from iwgnet_grasp.benchmark.rows import ROWS, Result
+from iwgnet_grasp.benchmark.rows import ROWS, Result, Run
 
 
 def main() -> int:
@@ -45,9 +45,13 @@ def main() -> int:
     results: list[Result] = []
     failed = False
     for row in rows:
+
+        def say(text: str, name: str = row.name) -> None:
+            console.print(f"{name}: {text}", style="dim")
+
         with console.status(f"{row.name}: {row.what} ..."):
             try:
-                results.append(row.measure(arguments.peers))
+                results.append(row.measure(Run(arguments.peers, say)))
             except BenchmarkError as error:
                 failed = True
                 console.print(f"{row.name}: {error}", style="red")

@@ -54,16 +54,24 @@ class Result:
 
 
 @dataclass(frozen=True)
+class Run:
+    """What a row is told: whether peers are to be measured, and where to tell its progress."""
+
+    peers: bool
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True)
 class Row:
     name: str
     what: str
-    measure: Callable[[bool], Result]
+    measure: Callable[[Run], Result]
 
 
 def _core_row(name: str, goal: Goal | None, peer_script: str = "", peer_name: str = "") -> Row:
-    def measure(peers: bool) -> Result:
+    def measure(run: Run) -> Result:
         ours = core(name)[name]
-        peer_value = peer(peer_script)["value"] if peers and peer_script else None
+        peer_value = peer(peer_script)["value"] if run.peers and peer_script else None
         value, unit, detail = ours["value"], ours["unit"], ours["detail"]
         return Result(name, value, unit, detail, goal, peer_name, peer_value)
 
@@ -81,7 +89,7 @@ _WHAT = {
 }
 
 
-def _ik_kdl(peers: bool) -> Result:
+def _ik_kdl(run: Run) -> Result:
     rows = core("ik", "ik_kdl")
     return Result(
         "ik_kdl",
@@ -93,24 +101,40 @@ def _ik_kdl(peers: bool) -> Result:
     )
 
 
-def _iwgnet(peers: bool) -> Result:
-    import numpy as np
+def _iwgnet_row(name: str, what: str, backend: str, rival: str, goal: Goal | None = None) -> Row:
+    """IWGNet's time on a window beside a rival's on the same backend, taken in turns."""
 
-    from iwgnet_grasp.networks.inference import GraspEstimator, torch_predictor
-    from iwgnet_grasp.networks.weights import load_weights
+    def measure(run: Run) -> Result:
+        from iwgnet_grasp.benchmark.networks import WINDOW_PX, one_window, usable
 
-    estimator = GraspEstimator("iwgnet")
-    size = estimator.input_px
-    window = np.random.default_rng(0).uniform(-0.1, 1, (1, size, size)).astype(np.float32)
-    ours = median_seconds(lambda: estimator._predict(window)) * 1e3
-    network, _ = load_weights("iwgnet")
-    plain = torch_predictor(network.eval(), bfloat16=False)
-    rival = median_seconds(lambda: plain(window)) * 1e3
-    detail = f"{size}x{size}, {estimator.backend}"
-    return Result("iwgnet", ours, "ms", detail, None, "torch float32", rival)
+        if backend != "auto" and backend not in usable():
+            raise BenchmarkError(f"backend {backend} is not installed here")
+        taken, times = one_window(backend)
+        ours = times["iwgnet"]
+        detail = f"{WINDOW_PX}x{WINDOW_PX}, {taken}; best of {ours.runs} {ours.best:.2f} ms"
+        return Result(name, ours.median, "ms", detail, goal, rival, times[rival].median)
+
+    return Row(name, what, measure)
 
 
-def _look(peers: bool) -> Result:
+def _iwgnet_ten(run: Run) -> Result:
+    from iwgnet_grasp.benchmark.networks import WINDOW_PX, ten_windows
+
+    taken, time = ten_windows()
+    detail = f"ten of {WINDOW_PX}x{WINDOW_PX}, {taken}; best of {time.runs} {time.best:.1f} ms"
+    return Result("iwgnet_ten", time.median, "ms", detail)
+
+
+def _detector(run: Run) -> Result:
+    from iwgnet_grasp.benchmark.networks import DETECTOR_INPUT, detector
+
+    taken, time = detector()
+    rows, columns = DETECTOR_INPUT
+    detail = f"{rows}x{columns}, {taken}; best of {time.runs} {time.best:.1f} ms"
+    return Result("detector", time.median, "ms", detail, Goal(20))
+
+
+def _look(run: Run) -> Result:
     from iwgnet_grasp import _core
     from iwgnet_grasp.perception import load_perception
     from iwgnet_grasp.perception.types import CameraIntrinsics
@@ -136,7 +160,7 @@ def _look(peers: bool) -> Result:
     return Result("look", value, "ms", detail, Goal(150))
 
 
-def _labels(peers: bool) -> Result:
+def _labels(run: Run) -> Result:
     from iwgnet_grasp.benchmark.labelling import measure_labelling
 
     depth, color = measure_labelling(False), measure_labelling(True)
@@ -159,7 +183,7 @@ def _noisy_pairs() -> dict:
         raise BenchmarkError(str(error)) from None
 
 
-def _hand_eye_error(peers: bool) -> Result:
+def _hand_eye_error(run: Run) -> Result:
     ours, visp = (_noisy_pairs()[name] for name in ("ours, pairs", "ViSP"))
     detail = f"15 pairs, 0.5 mm and 0.1 deg noise, 200 draws; {ours['deg']:.3f} deg"
     return Result(
@@ -167,14 +191,14 @@ def _hand_eye_error(peers: bool) -> Result:
     )
 
 
-def _hand_eye_time(peers: bool) -> Result:
+def _hand_eye_time(run: Run) -> Result:
     ours, visp = (_noisy_pairs()[name] for name in ("ours, pairs", "ViSP"))
     return Result(
         "hand_eye_time", ours["ms"], "ms", "the same pairs", Goal(visp["ms"]), "ViSP", visp["ms"]
     )
 
 
-def _calibration(peers: bool) -> Result:
+def _calibration(run: Run) -> Result:
     from iwgnet_grasp.calibration.measure import measure_images, summary
     from iwgnet_grasp.calibration.settings import CalibrationError
 
@@ -208,14 +232,14 @@ def _ten_in_process() -> dict:
         return _trial(Path(folder))
 
 
-def _physics(peers: bool) -> Result:
+def _physics(run: Run) -> Result:
     trial = _ten_in_process()
     factor = trial["sim_time_s"] / (trial["wall_time_s"] - trial["computing_time_s"])
     detail = "ten_stacked in one process, arm at work; looking and planning taken off"
     return Result("physics", factor, "x real time", detail, Goal(8, at_least=True))
 
 
-def _trial_in_process(peers: bool) -> Result:
+def _trial_in_process(run: Run) -> Result:
     trial = _ten_in_process()
     return Result(
         "trial_in_process",
@@ -243,25 +267,26 @@ def _ros_trial(scene: str, seed: int) -> tuple[dict, float]:
         return _trial(Path(folder)), wall
 
 
-def _trial_ros(peers: bool) -> Result:
+def _trial_ros(run: Run) -> Result:
     trial, wall = _ros_trial("five_scattered", 0)
     factor = trial["sim_time_s"] / trial["wall_time_s"]
     detail = f"five objects, start to end of scripts/start_grasping; {factor:.1f}x real time"
     return Result("trial_ros", wall, "s", detail, Goal(180))
 
 
-def _trial_ros_speed(peers: bool) -> Result:
+def _trial_ros_speed(run: Run) -> Result:
     trial, _ = _ros_trial("five_scattered", 1)
     factor = trial["sim_time_s"] / trial["wall_time_s"]
     detail = f"five objects over ROS, {trial['sim_time_s']:.0f} s simulated"
     return Result("trial_ros_speed", factor, "x real time", detail, Goal(1, at_least=True))
 
 
-def _success(peers: bool) -> Result:
+def _success(run: Run) -> Result:
     wins = []
     for seed in range(10):
-        trial, _ = _ros_trial("five_scattered", seed)
+        trial, wall = _ros_trial("five_scattered", seed)
         wins.append(trial["success"])
+        run.say(f"seed {seed}: {'success' if wins[-1] else 'FAILED'} after {wall:.0f} s")
     lost = [str(seed) for seed, won in enumerate(wins) if not won]
     detail = "five_scattered over ROS, seeds 0-9" + (f"; failed: {', '.join(lost)}" if lost else "")
     return Result("success", sum(wins), "of 10", detail, Goal(9, at_least=True))
@@ -280,7 +305,14 @@ ROWS = (
     Row("hand_eye_error", "hand-eye error on noisy pairs against ViSP", _hand_eye_error),
     Row("hand_eye_time", "hand-eye refinement against ViSP's time", _hand_eye_time),
     Row("calibration", "error of whole calibrations with images, seeds 0-19", _calibration),
-    Row("iwgnet", "IWGNet on one window, fastest backend", _iwgnet),
+    _iwgnet_row("iwgnet", "IWGNet on one window, fastest backend", "auto", "ggcnn", Goal(6)),
+    _iwgnet_row("iwgnet_grconvnet", "the same beside GR-ConvNet", "auto", "grconvnet"),
+    *(
+        _iwgnet_row(f"iwgnet_{backend}", f"IWGNet on {backend}", backend, "ggcnn")
+        for backend in ("openvino", "onnxruntime", "torch")
+    ),
+    Row("iwgnet_ten", "IWGNet on the ten windows of a look", _iwgnet_ten),
+    Row("detector", "the detector on one image", _detector),
     Row("look", "detection, IWGNet and order of a pile of ten", _look),
     Row("labels", "labelled samples from settled scenes", _labels),
     Row("trial_in_process", "a ten-object trial in one process", _trial_in_process),

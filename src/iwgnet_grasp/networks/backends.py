@@ -11,6 +11,7 @@ import hashlib
 import importlib.util
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -48,7 +49,7 @@ def fastest_that_agrees(model: InferenceModel) -> tuple[str, Runner]:
 
     The order is fixed. Timed at the start it would depend on what else the machine does, and the
     last bits of the maps are the backend's: the same trial must give the same result.
-    `scripts/benchmark --only backends` measures the order.
+    Rows iwgnet_BACKEND of scripts/benchmark measure it.
     """
     exact = model.exact(model.probe)
     for name in FASTEST_FIRST["gpu" if torch.cuda.is_available() else "cpu"]:
@@ -111,14 +112,19 @@ def onnxruntime_runner(model: InferenceModel) -> Runner:
     return image_by_image(lambda image: session.run(None, {model.input_name: image}))
 
 
-def openvino_runner(model: InferenceModel) -> Runner:
-    """OpenVINO on the CPU, which takes bfloat16 where the CPU computes in it."""
+def openvino_runner(
+    model: InferenceModel, path: Path | None = None, settings: dict[str, str] | None = None
+) -> Runner:
+    """OpenVINO on the CPU, which takes bfloat16 where the CPU computes in it.
+
+    path: a file of OpenVINO's own to read in place of the model's ONNX; settings: of the plugin.
+    """
     import openvino
 
     core = openvino.Core()
+    graph = core.read_model(path) if path else core.read_model(model.onnx(), b"")
     # Latency: one look at a time.
-    settings = {"PERFORMANCE_HINT": "LATENCY"}
-    compiled = core.compile_model(core.read_model(model.onnx(), b""), "CPU", settings)
+    compiled = core.compile_model(graph, "CPU", {"PERFORMANCE_HINT": "LATENCY", **(settings or {})})
     request = compiled.create_infer_request()
 
     def one(image: np.ndarray) -> list[np.ndarray]:

@@ -3,6 +3,7 @@ tracing, so it is done once for each state of weights, code and library, and kep
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
@@ -87,7 +88,8 @@ def cached(name: str, make: Callable[[], bytes]) -> bytes:
         temporary.write_bytes(content)
         temporary.replace(path)
     except OSError:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
     return content
 
 
