@@ -17,10 +17,15 @@ from iwgnet_grasp.cluster import ClusterError, connect
 from iwgnet_grasp.trials import batch
 from iwgnet_grasp.trials.batch import BatchError, Run, read_records, read_run, run_trials
 from iwgnet_grasp.trials.command import chosen_scenes
-from iwgnet_grasp.trials.comparison import named_comparison, sweep
-from iwgnet_grasp.trials.overrides import OverrideError
+from iwgnet_grasp.trials.comparison import (
+    compare,
+    named_comparison,
+    read_comparison,
+    sweep,
+)
+from iwgnet_grasp.trials.overrides import changed_config
 from iwgnet_grasp.trials.pool import PoolError, run_with_ray
-from iwgnet_grasp.trials.worker import Conditions
+from iwgnet_grasp.trials.worker import PACKAGE, Conditions
 
 RUN = Run(("five_scattered", "ten_stacked"), 2, 10)
 
@@ -139,13 +144,38 @@ def test_a_sweep_is_every_combination():
     assert [run.conditions.overrides for run in runs.values()] == [
         {"priority.alpha": a, "priority.beta": b} for a in (0, 1) for b in (0.5, 2)
     ]
-    with pytest.raises(OverrideError, match="did you mean 'beta'"):
-        sweep(["priority.bta=1"]).runs(RUN)
+
+
+@pytest.mark.parametrize(
+    "axis, says",
+    [
+        ("priority.bta=1", "did you mean 'beta'"),
+        ("perception.grasps.weights=models/iwgnet.safetensors,models/no.safetensors", "models/no"),
+        ("supervisor.replan=once", "is --replan"),
+    ],
+)
+def test_a_comparison_that_cannot_end_does_not_begin(tmp_path, axis, says):
+    with pytest.raises(ValueError, match=says):
+        compare(sweep([axis]), RUN, tmp_path / "out", lambda *_: pytest.fail("a trial ran"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_comparison_runs_every_variant_on_the_same_seeds(tmp_path, table):
+    result = compare(
+        named_comparison("priority"), RUN, tmp_path, lambda run, out, _: run_trials(run, out)
+    )
+    assert table.ran == RUN.tasks() * 4
+    assert [v["name"] for v in result["variants"]][0] == "random order"
+    assert all(v["summary"]["all"]["trials"] == 4 for v in result["variants"])
+    assert read_comparison(tmp_path) == result
 
 
 def test_every_comparison_of_the_package_sets_existing_keys():
     for name in ("priority", "replan", "networks"):
         runs = named_comparison(name).runs(RUN)
+        for run in runs.values():
+            with changed_config(PACKAGE / "config", run.conditions.overrides):
+                pass
         assert len(set(map(repr, runs.values()))) == len(runs) >= 2  # and each differs
     assert named_comparison("replan").runs(RUN)["once (paper)"].conditions.replan == "once"
     with pytest.raises(BatchError, match="did you mean 'priority'"):

@@ -143,7 +143,7 @@ def read_run(out: Path) -> Run:
 def _claim(out: Path, run: Run) -> None:
     """Writes settings.json, or compares it: only the number of trials may grow."""
     path = out / "settings.json"
-    settings = {**_as_json(run), "inputs": _inputs(run.conditions)}
+    settings = {**_as_json(run), "inputs": inputs(run.conditions)}
     if path.exists():
         try:
             stored = json.loads(path.read_text())
@@ -178,8 +178,11 @@ def _as_json(run: Run) -> dict:
     return settings
 
 
-def _inputs(conditions: Conditions) -> dict[str, str]:
-    """Digests of the settings and weights that the trials depend on, by file."""
+def inputs(conditions: Conditions) -> dict[str, str]:
+    """Digests of the settings and weights that the trials depend on, by file. Raises BatchError or
+    OverrideError for what does not exist."""
+    if "supervisor.replan" in conditions.overrides:
+        raise BatchError("--set supervisor.replan: is --replan here")
     with changed_config(PACKAGE / "config", conditions.overrides) as config_dir:
         paths = {f"config/{p.name}": p for p in sorted(config_dir.glob("*.yaml"))}
         perception = yaml.safe_load((config_dir / "perception.yaml").read_text())

@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
-from iwgnet_grasp.trials.batch import BatchError, Run, read_summary
-from iwgnet_grasp.trials.overrides import changed_config, parse_override
+from iwgnet_grasp.trials.batch import BatchError, Run, inputs, read_summary
+from iwgnet_grasp.trials.overrides import parse_override
 from iwgnet_grasp.trials.record import write_json
 from iwgnet_grasp.trials.worker import PACKAGE
 
@@ -32,13 +32,11 @@ class Comparison:
     arguments: str
 
     def runs(self, base: Run) -> dict[str, Run]:
-        """Run by variant. Raises BatchError or OverrideError for settings that do not exist."""
+        """Run by variant."""
         runs = {}
         for name, settings in self.variants.items():
             overrides = {**base.conditions.overrides, **settings}
             replan = overrides.pop("replan", base.conditions.replan)
-            with changed_config(PACKAGE / "config", overrides):
-                pass  # a key that does not exist is named before the first trial runs
             conditions = replace(base.conditions, overrides=overrides, replan=replan)
             runs[name] = replace(base, conditions=conditions)
         return runs
@@ -80,10 +78,13 @@ def compare(
     run_one: Callable[[Run, Path, str], dict],
 ) -> dict:
     """Runs each variant by run_one(run, folder, name) -> summary; returns and writes what
-    read_comparison() reads."""
+    read_comparison() reads. Raises BatchError or OverrideError for settings or weights that do not
+    exist, before anything runs."""
+    runs = comparison.runs(base)
+    for run in runs.values():
+        inputs(run.conditions)  # keys and weights that do not exist: before the first trial
     out.mkdir(parents=True, exist_ok=True)
     folders = {name: folder_name(name) for name in comparison.variants}
-    runs = comparison.runs(base)
     for name, run in runs.items():
         run_one(run, out / folders[name], name)
     write_json(

@@ -110,7 +110,7 @@ def lift_all(
     piles: dict[int, dict[HeldOutObject, list[Grasp]]] = {}
     for name, grasp in keys:
         if (name, grasp) not in outcomes:
-            thing = HeldOutObject(name, _mask_digest(_mask(folder, name)))
+            thing = HeldOutObject(name, _stored_mask_digest(folder, name))
             piles.setdefault(thing.scene // LOOKS, {}).setdefault(thing, []).append(grasp)
     if not piles:
         return outcomes
@@ -150,7 +150,10 @@ def lift_pile(
 
     # All looks first: a lift sets the cell's time back, and later looks would come out otherwise.
     looks = max(thing.scene for thing in wanted) - pile * LOOKS + 1
-    scenes = dict(enumerate(islice(maker.pile(seed, pile), looks), start=pile * LOOKS))
+    try:
+        scenes = dict(enumerate(islice(maker.pile(seed, pile), looks), start=pile * LOOKS))
+    except DataError:  # a pile of another version, which cannot be built by this one
+        return []
     lifter = Lifter(maker.cell)
     results = []
     for thing, grasps in sorted(wanted.items(), key=lambda item: item[0].name):
@@ -209,12 +212,11 @@ def simulator_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _mask(folder: Path, name: str) -> np.ndarray:
+def _stored_mask_digest(folder: Path, name: str) -> str:
+    """ "" for a mask that is missing or broken: no scene comes out like that."""
     path = folder / name.partition("_")[2] / f"{name}_mask.png"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise DataError(f"{path}: missing or not an image")
-    return image > 0
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    return "" if image is None else _mask_digest(image > 0)
 
 
 def _mask_digest(mask: np.ndarray) -> str:
