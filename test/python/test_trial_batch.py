@@ -132,6 +132,13 @@ def test_a_folder_with_something_else_is_refused(tmp_path, table):
     assert not table.ran
 
 
+def test_a_run_of_no_trial_or_of_a_negative_seed_is_none():
+    with pytest.raises(BatchError, match="--trials"):
+        replace(RUN, trials=0)
+    with pytest.raises(BatchError, match="--seed"):
+        replace(RUN, first_seed=-1)
+
+
 def test_scenes_are_named_once_each_and_known():
     assert chosen_scenes("ten_stacked,five_scattered") == ("ten_stacked", "five_scattered")
     assert set(chosen_scenes("all")) >= {"five_scattered", "seven_stacked", "ten_stacked"}

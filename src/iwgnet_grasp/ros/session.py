@@ -79,7 +79,7 @@ class Session:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # ctrl-C comes to us alone, we stop it in good order
-                preexec_fn=_stop_with_parent,
+                preexec_fn=stop_with_parent,
             )
         try:
             self._wait_for_nodes()
@@ -203,7 +203,7 @@ def _last_words(text: str, node: str) -> str:
     return f": {said[-1].removeprefix(node + ': ')}" if said else ""
 
 
-def _stop_with_parent() -> None:
+def stop_with_parent() -> None:
     """In the child: SIGINT when the parent dies, by whatever cause."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 

@@ -23,7 +23,7 @@ from iwgnet_grasp.trials.record import write_json
 from iwgnet_grasp.trials.statistics import Record, summary
 from iwgnet_grasp.trials.worker import PACKAGE, Conditions, make_worker
 
-_NOT_OF_TRIALS = ("dataset.yaml", "detector_training.yaml")
+_NOT_OF_TRIALS = ("comparisons.yaml", "dataset.yaml", "detector_training.yaml")
 
 
 class BatchError(ValueError):
@@ -38,6 +38,12 @@ class Run:
     trials: int
     first_seed: int
     conditions: Conditions = Conditions()
+
+    def __post_init__(self) -> None:
+        if self.trials < 1:
+            raise BatchError("--trials must be at least 1")
+        if self.first_seed < 0:
+            raise BatchError("--seed must not be negative")
 
     def tasks(self) -> list[Task]:
         """Seed by seed, so that a run that is cut off has as many trials of each scene."""
@@ -61,9 +67,9 @@ def run_trials(
     """Runs what is still to be run; returns the summary, which is also in out/summary.json.
 
     on_start is told the trials that the folder holds already, on_record each new one, `say` what
-    else a person should know. Raises
-    BatchError for a folder of another run, PoolError or CellError when trials cannot go on; what
-    was finished stays in the folder, also after KeyboardInterrupt.
+    else a person should know. Raises BatchError for a folder of another run, PoolError or
+    CellError when trials cannot go on; what was finished stays in the folder, also after
+    KeyboardInterrupt.
     """
     out.mkdir(parents=True, exist_ok=True)
     _claim(out, run)
@@ -86,6 +92,12 @@ def run_trials(
         result = {"run": _as_json(run), **summary(records, run.scenes)}
         write_json(out / "summary.json", result)
     return result
+
+
+def read_summary(out: Path) -> dict:
+    """The summary of a folder's trials as they are now. Raises BatchError."""
+    run = read_run(out)
+    return {"run": _as_json(run), **summary(read_records(out), run.scenes)}
 
 
 def _records(
@@ -115,15 +127,6 @@ def read_records(out: Path) -> list[Record]:
         return [json.loads(line) for line in whole.splitlines()]
     except json.JSONDecodeError as error:
         raise BatchError(f"{path}: is not a file of trials ({error})") from None
-
-
-def read_summary(out: Path) -> dict:
-    """summary.json of a folder. Raises BatchError."""
-    path = out / "summary.json"
-    try:
-        return json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise BatchError(f"{path}: is not the summary of a run ({error})") from None
 
 
 def read_run(out: Path) -> Run:

@@ -101,9 +101,7 @@ def run(
     )
     out = out or _new_folder(scene)
     with Progress() as progress:
-        summary = checked_run(
-            Run(scenes, trials, seed, conditions), out, workers, address, progress
-        )
+        summary = run_shown(Run(scenes, trials, seed, conditions), out, workers, address, progress)
     print_table(summary)
     typer.echo(f"trials and summary in {out}")
 
@@ -141,7 +139,7 @@ def replay_command(
         if changes or calibration or camera_offset >= 0 or replan is not Replan.every:
             raise BatchError("--like: takes all settings from the run; give none beside it")
         conditions = replace(read_run(like).conditions, transport="inprocess")
-        found = [r for r in read_records(like) if (r["scene"], r["seed"]) == (scene, seed)]
+        found = [r for r in read_records(like) if (r["scene"], r["seed"]) == (scenes[0], seed)]
         if not found:
             raise BatchError(f"--like {like}: holds no trial of {scene} with seed {seed}")
         before = found[0]
@@ -204,7 +202,7 @@ def compare_command(
             comparison,
             base,
             out,
-            lambda run, folder, title: checked_run(run, folder, workers, address, progress, title),
+            lambda run, folder, title: run_shown(run, folder, workers, address, progress, title),
         )
     print_comparison(result)
     typer.echo(f"trials, summaries and comparison in {out}")
@@ -234,11 +232,8 @@ def report_command(
     summaries = {}
     for folder in runs:
         summary = read_summary(folder)
-        title = (
-            "One look, one sequence"
-            if summary["run"]["replan"] == "once"
-            else ("A look after each pick")
-        )
+        once = summary["run"]["replan"] == "once"
+        title = "One look, one sequence" if once else "A look after each pick"
         if summary["run"]["transport"] == "ros":
             title += ", over ROS"
         if title in summaries:
@@ -258,14 +253,10 @@ def report_command(
         typer.echo(f"wrote the sections {', '.join(write_docs(report))} of docs/results.md")
 
 
-def checked_run(
+def run_shown(
     run: Run, out: Path, workers: int, address: str | None, progress: Progress, name: str = ""
 ) -> dict:
-    """run_trials() with a progress bar, and with its arguments checked first."""
-    if run.trials < 1:
-        raise BatchError("--trials must be at least 1")
-    if run.first_seed < 0:
-        raise BatchError("--seed must not be negative")
+    """run_trials() with a progress bar."""
     progress.begin(run, name)
     try:
         return run_trials(run, out, workers, address, progress.found, progress.add, progress.say)

@@ -39,11 +39,8 @@ class Conditions:
 
 def make_worker(conditions: Conditions, log_dir: Path) -> Worker:
     """log_dir: for the logs of failed trials over ROS."""
-    return (
-        RosWorker(conditions, log_dir)
-        if conditions.transport == "ros"
-        else InProcessWorker(conditions)
-    )
+    ros = conditions.transport == "ros"
+    return RosWorker(conditions, log_dir) if ros else InProcessWorker(conditions)
 
 
 class _Configured:
@@ -108,7 +105,7 @@ class RosWorker(_Configured):
         self._log_dir = log_dir
 
     def run(self, scene: str, seed: int) -> Record:
-        from iwgnet_grasp.ros.session import free_master_uri
+        from iwgnet_grasp.ros.session import free_master_uri, stop_with_parent
 
         out = self._log_dir / f"{scene}_{seed}"
         command = [sys.executable, "-m", "iwgnet_grasp.ros.grasping"]
@@ -126,6 +123,7 @@ class RosWorker(_Configured):
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,  # ctrl-C comes to us alone
+            preexec_fn=stop_with_parent,
         )
         try:
             _, said = process.communicate()
