@@ -260,6 +260,8 @@ def test_objects_that_do_not_come_out_as_stored_are_not_lifted(rods, tmp_path):
     generator = json.loads((other / "dataset.json").read_text())
     wanted = {name: [Grasp(150.0, 150.0, 0.0, 30.0, 0.5)]}
     assert lift_all(other, generator, wanted, tmp_path / "lifts.jsonl") == {}
+    path.unlink()
+    assert lift_all(other, generator, wanted, tmp_path / "lifts.jsonl") == {}
 
 
 def test_the_page_names_every_network_and_set(rods, tmp_path):
