@@ -22,7 +22,6 @@ from iwgnet_grasp.perception import (
 )
 from iwgnet_grasp.perception.detector import Detector
 from iwgnet_grasp.perception.merged_depth import (
-    MARGIN_PX,
     centroid,
     crop_window,
     grasp_depth,
@@ -82,23 +81,18 @@ def test_metres_leaves_its_input_alone():
     assert depth[0, 1] == -1.0
 
 
-def test_merge_takes_the_box_from_the_scene_and_the_rest_from_the_empty_scene():
+def test_merge_takes_the_box_from_the_scene_and_mirrors_what_lies_around_it():
     depth = scene()
-    depth[100, 100] = 0.5  # another object
+    depth[100, 100] = TABLE - 0.1  # another object
+    depth[100, 101] = np.nan
     depth[210, 320] = np.nan
     merged = merge(depth, table(), BOX)
     np.testing.assert_array_equal(merged[BOX.slices], depth[BOX.slices])
+    assert merged[100, 100] == pytest.approx(TABLE + 0.1)
+    merged[100, 100] = TABLE
     outside = np.ones(depth.shape, bool)
     outside[BOX.slices] = False
     assert np.all(merged[outside] == np.float32(TABLE))
-
-
-def with_margin(box: Box) -> Box:
-    """The box and MARGIN_PX around it, inside a 640x480 image."""
-    left, top = max(box.x - MARGIN_PX, 0), max(box.y - MARGIN_PX, 0)
-    right = min(box.x + box.width + MARGIN_PX, 640)
-    bottom = min(box.y + box.height + MARGIN_PX, 480)
-    return Box(left, top, right - left, bottom - top)
 
 
 def test_window_is_centred_on_the_box_at_native_resolution():
@@ -106,8 +100,7 @@ def test_window_is_centred_on_the_box_at_native_resolution():
     window = crop_window(depth, table(), BOX, 224)
     rows, columns = (slice(window.y, window.y + 224), slice(window.x, window.x + 224))
     assert window.depth.shape == window.empty.shape == (224, 224)
-    expected = merge(depth, table(), with_margin(BOX))
-    np.testing.assert_array_equal(window.depth, expected[rows, columns])
+    np.testing.assert_array_equal(window.depth, merge(depth, table(), BOX)[rows, columns])
     u, v = BOX.center
     assert abs(window.x + 111.5 - u) <= 0.5
     assert abs(window.y + 111.5 - v) <= 0.5
@@ -125,7 +118,7 @@ def test_window_never_leaves_the_image(x, y, width, height):
     window = crop_window(depth, table(), box, 224)
     assert 0 <= window.x <= 640 - 224
     assert 0 <= window.y <= 480 - 224
-    expected = merge(depth, table(), with_margin(box))
+    expected = merge(depth, table(), box)
     np.testing.assert_array_equal(
         window.depth, expected[window.y : window.y + 224, window.x : window.x + 224]
     )

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 
-# Height (m) that the network sees as 1: parts are some 20 mm thick. Negative heights (noise below
-# the table) and piles keep their sign and order up to the clip.
+# Height (m) that the network sees as 1: parts are some 20 mm thick. Negative heights are
+# what lies around the object (perception.merged_depth.merge).
 HEIGHT_UNIT = 0.02
-HEIGHT_CLIP = (-1.0, 5.0)
+HEIGHT_CLIP = (-5.0, 5.0)
 _PLANE_STEP = 4  # px between the samples that the plane is fitted to
 _PLANE_SCALES = (0.03, 0.015, 0.008, 0.004, 0.003, 0.003)  # m, residual at half weight, by round
 
@@ -32,8 +32,8 @@ def support_plane(depth: np.ndarray) -> np.ndarray:
     scale = float(max(height, width))
     basis = np.stack([u[valid] / scale, v[valid] / scale, np.ones(valid.sum())], axis=1)
     target = z[valid].astype(np.float64)
-    # Start beyond the median: objects lie on the near side of the plane.
-    plane = np.array([0.0, 0.0, np.percentile(target, 70)])
+    # The table lies between the object and what merging has mirrored below it.
+    plane = np.array([0.0, 0.0, np.median(target)])
     for residual_scale in _PLANE_SCALES:
         residual = (target - basis @ plane) / residual_scale
         residual[residual < 0] *= 2

@@ -87,6 +87,7 @@ class SceneMaker:
         self.detector = detector  # whether colour images are made
         self.cell = _core.SimulatedCell(str(package_dir))
         self.labeler = _core.GraspLabeler(str(package_dir / "config"))
+        self.pose_config = _core.load_grasp_pose_config(str(package_dir / "config"))
 
     def pile(self, seed: int, pile: int) -> Iterator[Scene]:
         """The LOOKS scenes of a pile. Raises DataError when no attempt can be built."""
@@ -209,7 +210,7 @@ class SceneMaker:
         ideal, mask = cell.ideal_depth(), cell.part_mask()
         stereo = cell.aligned_depth(cell.depth())
         outline_areas = cell.unoccluded_areas()
-        labels = self.labeler.label(cell, ideal, mask)
+        labels = self.executable(self.labeler.label(cell, ideal, mask), stereo)
         cell.show_parts(False)
         empty_ideal = cell.ideal_depth()
         empty_stereo = cell.aligned_depth(cell.depth())
@@ -237,6 +238,20 @@ class SceneMaker:
         self.cell.camera = small
         self.cell.color()
         self.cell.camera = whole
+
+    def executable(self, labels: list, stereo: np.ndarray) -> list:
+        """The labels that can be carried out with what the camera measures, too: a grasp that is
+        only free by less than the noise is none."""
+        camera, config = self.cell.camera, self.cell.config
+        view = camera.color, camera.T_base_color
+        heights = self.core.HeightMap(stereo, *view, config, border=0.11)
+        return [
+            label
+            for label in labels
+            if self.core.grasp_pose(
+                label.rectangle, *view, heights, config, self.pose_config
+            ).feasible
+        ]
 
     def visible(self, seen: np.ndarray, outline_area: float) -> np.ndarray | None:
         """The part's mask without crumbs; None when too little of it is seen."""

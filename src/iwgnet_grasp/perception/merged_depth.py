@@ -6,11 +6,6 @@ import numpy as np
 
 from iwgnet_grasp.perception.types import Box, GraspRectangle, PerceptionError, Window
 
-# px around an object's box that are pasted with it. A finger reaches 20-25 mm beyond what it grips
-# (half the play of the opening and its own thickness), which is as many pixels at 0.6 m: the network
-# has to see the neighbour that is in its way. The paper pastes the box alone.
-MARGIN_PX = 24
-
 
 def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
     """Depth image in float32 metres, NaN where invalid (0, negative or not finite).
@@ -38,10 +33,16 @@ def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
 def merge(depth: np.ndarray, empty_depth: np.ndarray, box: Box) -> np.ndarray:
     """The empty scene's depth with the box's part of `depth` pasted in (Fig. 8b), (H, W) m.
 
+    Beyond the paper, what lies outside the box is kept as an obstacle, mirrored at the empty scene:
+    a neighbour becomes a pit as deep as it is high. The network sees what bars fingers and palm (the
+    2F-85 reaches 75 mm beyond the grasp) and cannot take it for the object.
     A pixel of the box that was not measured stays NaN: the grasp network fills holes itself, in
-    the same way as it did in training. A pixel that only the empty scene lacks stays NaN too.
+    the same way as it did in training. A pixel that only the empty scene lacks stays NaN too;
+    outside the box an unmeasured pixel shows the empty scene.
     """
-    merged = empty_depth.copy()
+    merged = 2 * empty_depth - depth
+    unmeasured = np.isnan(depth)
+    merged[unmeasured] = empty_depth[unmeasured]
     merged[box.slices] = depth[box.slices]
     return merged
 
@@ -49,7 +50,6 @@ def merge(depth: np.ndarray, empty_depth: np.ndarray, box: Box) -> np.ndarray:
 def crop_window(depth: np.ndarray, empty_depth: np.ndarray, box: Box, size: int) -> Window:
     """The (size, size) window of the merged depth around the box's middle, at native resolution.
 
-    Pasted is the box with MARGIN_PX around it.
     At the border of the image the window is moved inwards, so that it never leaves the image.
     Raises PerceptionError when the image is smaller than the window.
     """
@@ -63,11 +63,13 @@ def crop_window(depth: np.ndarray, empty_depth: np.ndarray, box: Box, size: int)
     y = min(max(round(v - (size - 1) / 2), 0), height - size)
     window = slice(y, y + size), slice(x, x + size)
     empty = empty_depth[window].copy()
-    left, top = max(box.x - MARGIN_PX - x, 0), max(box.y - MARGIN_PX - y, 0)
-    right = min(box.x + box.width + MARGIN_PX - x, size)
-    bottom = min(box.y + box.height + MARGIN_PX - y, size)
-    pasted = Box(left, top, right - left, bottom - top)
-    return Window(x, y, merge(depth[window], empty, pasted), empty)
+    inside = Box(
+        max(box.x - x, 0),
+        max(box.y - y, 0),
+        min(box.x + box.width - x, size) - max(box.x - x, 0),
+        min(box.y + box.height - y, size) - max(box.y - y, 0),
+    )
+    return Window(x, y, merge(depth[window], empty, inside), empty)
 
 
 def object_mask(
