@@ -146,6 +146,7 @@ def trial_of(table, out, replan="every"):
         scene="five_scattered",
         seed=3,
         transport="in_process",
+        backends={"grasps": "torch"},
         out=out,
         judge=table.verdict,
         say=quiet,
@@ -158,6 +159,7 @@ def test_trial_json_holds_the_judges_word_for_each_pick(tmp_path):
     assert written == trial.to_json()
     assert trial.success and written["success"] is True
     assert (written["scene"], written["seed"], written["replan"]) == ("five_scattered", 3, "every")
+    assert written["backends"] == {"grasps": "torch"}
     assert written["transport"] == "in_process"
     assert written["objects"] == 2
     assert written["sim_time_s"] == pytest.approx(2 * PICK_SECONDS)
