@@ -69,6 +69,7 @@ def test_difference_is_a_mean_and_relative_to_large_outputs():
     assert difference([small], [small + 0.02]) == pytest.approx(0.02)
     assert difference([large], [large + 0.02]) == pytest.approx(0.002)
     assert difference([small, large], [small, large + 1]) == pytest.approx(0.1)
+    assert np.isnan(difference([small, large], [small, large * np.nan]))
 
 
 def test_auto_is_the_first_in_order_that_agrees(monkeypatch, caplog):
