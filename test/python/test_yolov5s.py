@@ -77,14 +77,26 @@ def test_decoded_box_may_leave_its_cell_by_half_and_grow_to_four_anchors():
 
 def test_decode_lists_every_anchor_of_every_scale():
     maps = [torch.zeros(1, 64 // s, 96 // s, 3, 7) for s in STRIDES]
-    boxes, scores = decode(maps, torch.tensor(ANCHORS, dtype=torch.float32))
+    ((boxes, scores),) = decode(maps, torch.tensor(ANCHORS, dtype=torch.float32))
     count = 3 * sum((64 // s) * (96 // s) for s in STRIDES)
-    assert boxes.shape == (1, count, 4)
-    assert scores.shape == (1, count, 2)
+    assert boxes.shape == (count, 4)
+    assert scores.shape == (count, 2)
     assert torch.all(scores == 0.25)  # sigmoid(0) x sigmoid(0)
     # Row-major: the second cell of the first row lies one stride to the right.
-    middle = (boxes[0, :, :2] + boxes[0, :, 2:]) / 2
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     assert middle[3].tolist() == [12.0, 4.0]
+
+
+def test_decode_leaves_out_cells_without_objects():
+    maps = [torch.full((2, 64 // s, 96 // s, 3, 6), -9.0) for s in STRIDES]
+    maps[1][1, 2, 4, 0, :] = 0.0
+    anchors = torch.tensor(ANCHORS, dtype=torch.float32)
+    empty, one = decode(maps, anchors, 0.3)
+    assert empty[0].shape == (0, 4) and empty[1].shape == (0, 1)
+    width, height = ANCHORS[1][0]
+    x, y = 4.5 * 16, 2.5 * 16
+    expected = [x - width / 2, y - height / 2, x + width / 2, y + height / 2]
+    assert one[0].tolist() == [expected] and one[1].tolist() == [[0.25]]
 
 
 def test_iou_of_known_boxes():
@@ -116,6 +128,17 @@ def test_suppression_keeps_the_best_of_overlapping_boxes_of_a_class():
     # IoU 9/11 with the first box: one object, whose box is their mean weighted by 0.9 and 0.8.
     assert kept[0].tolist() == pytest.approx([0.9 / 1.7, 0, 10 + 0.9 / 1.7, 10])
     assert len(non_maximum_suppression(boxes, scores, 0.25, 0.5, 2)[0]) == 2
+
+
+def test_a_box_that_crosses_a_better_one_loses_score_by_their_overlap():
+    boxes = torch.tensor([[0.0, 0, 10, 10], [2, 0, 12, 10], [5, 0, 15, 10]])  # IoU 2/3 and 1/3
+    scores = torch.tensor([[0.9], [0.8], [0.7]])
+    kept, score, _ = non_maximum_suppression(boxes, scores, 0.2, 0.5, 10)
+    # Of the last two, too, IoU is 7/13 > 0.5.
+    assert score.tolist() == pytest.approx([0.9, 0.7])  # 0.8 (1 - 2/3) (1 - 7/13) < 0.2
+    assert kept.tolist() == [[0, 0, 10, 10], [5, 0, 15, 10]]
+    _, score, _ = non_maximum_suppression(boxes[:2], scores[:2], 0.2, 0.5, 10)
+    assert score.tolist() == pytest.approx([0.9, 0.8 / 3])
 
 
 def test_suppression_of_nothing_gives_nothing():

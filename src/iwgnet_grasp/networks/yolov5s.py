@@ -162,30 +162,37 @@ def decode_boxes(logits: Tensor, cell: Tensor, anchor: Tensor, stride: float) ->
     return torch.cat((center, (2 * t[..., 2:4]) ** 2 * anchor), -1)
 
 
-def decode(maps: list[Tensor], anchors: Tensor) -> tuple[Tensor, Tensor]:
-    """Boxes (B, N, 4) as x1, y1, x2, y2 in input px and class scores (B, N, classes).
+def decode(maps: list[Tensor], anchors: Tensor, least: float = 0.0) -> list[tuple[Tensor, Tensor]]:
+    """Of each image the boxes (N, 4) as x1, y1, x2, y2 in input px and their scores (N, classes).
 
-    A score is objectness x class probability. maps: from YOLOv5s.forward; anchors: (3, 3, 2) px.
+    A score is objectness x class probability; only boxes of an objectness above `least` are made.
+    maps: from YOLOv5s.forward; anchors: (3, 3, 2) px.
     """
-    boxes, scores = [], []
-    for logits, anchor, stride in zip(maps, anchors, STRIDES, strict=True):
-        rows, columns = logits.shape[1:3]
-        cell = torch.stack(
-            torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1
-        ).to(logits)
-        xywh = decode_boxes(logits, cell[None, :, :, None], anchor.to(logits), stride)
-        half = xywh[..., 2:] / 2
-        boxes.append(torch.cat((xywh[..., :2] - half, xywh[..., :2] + half), -1).flatten(1, 3))
-        probability = logits[..., 4:].sigmoid()
-        scores.append((probability[..., :1] * probability[..., 1:]).flatten(1, 3))
-    return torch.cat(boxes, 1), torch.cat(scores, 1)
+    images = []
+    for image in range(len(maps[0])):
+        boxes, scores = [], []
+        for logits, anchor, stride in zip(maps, anchors, STRIDES, strict=True):
+            present = logits[image, ..., 4].sigmoid() > least
+            row, column, shape = present.nonzero(as_tuple=True)
+            chosen = logits[image, row, column, shape]
+            cell = torch.stack((column, row), -1).to(logits)
+            xywh = decode_boxes(chosen, cell, anchor.to(logits)[shape], stride)
+            half = xywh[:, 2:] / 2
+            boxes.append(torch.cat((xywh[:, :2] - half, xywh[:, :2] + half), -1))
+            probability = chosen[:, 4:].sigmoid()
+            scores.append(probability[:, :1] * probability[:, 1:])
+        images.append((torch.cat(boxes), torch.cat(scores)))
+    return images
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union of corner boxes (N, 4) and (M, 4) -> (N, M)."""
-    low = torch.maximum(a[:, None, :2], b[None, :, :2])
-    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
-    common = (high - low).clamp(min=0).prod(-1)
+    width, height = (
+        torch.minimum(a[:, None, axis + 2], b[None, :, axis + 2])
+        - torch.maximum(a[:, None, axis], b[None, :, axis])
+        for axis in (0, 1)
+    )
+    common = width.clamp(min=0) * height.clamp(min=0)
     area_a = (a[:, 2:] - a[:, :2]).prod(-1)
     area_b = (b[:, 2:] - b[:, :2]).prod(-1)
     return common / (area_a[:, None] + area_b[None] - common).clamp(min=1e-9)
@@ -194,29 +201,35 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 def non_maximum_suppression(
     boxes: Tensor, scores: Tensor, score_threshold: float, iou_threshold: float, max_objects: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Greedy suppression within each class on one image's boxes (N, 4) and scores (N, classes).
+    """Soft-NMS (Bodla et al. 2017, linear) on one image's boxes (N, 4) and scores (N, classes).
 
-    Returns boxes (K, 4), scores (K,) and classes (K,), K <= max_objects, by descending score. A
-    box is the mean, weighted by the scores, of all that agree with the best to SAME_BOX_IOU: the
-    errors of neighbouring cells and anchors are partly independent.
+    Returns boxes (K, 4), scores (K,) and classes (K,), K <= max_objects, by descending score. The
+    best box stands; the score of another of its class that overlaps it by more than iou_threshold
+    is multiplied by 1 - IoU, since crossing parts overlap as much as two answers for one part do.
+    Those beyond SAME_BOX_IOU are the same part, and its box is their mean weighted by their scores:
+    the errors of neighbouring cells and anchors are partly independent.
     """
     score, label = scores.max(-1)
     chosen = torch.nonzero(score > score_threshold).squeeze(1)
     chosen = chosen[score[chosen].argsort(descending=True, stable=True)][:1000]
     boxes, score, label = boxes[chosen], score[chosen], label[chosen]
     overlap = box_iou(boxes, boxes) * (label[:, None] == label[None])
-    rival = overlap > iou_threshold
-    alive = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+    same = overlap > SAME_BOX_IOU
     kept: list[int] = []
-    for i in range(len(boxes)):
-        if alive[i]:
-            kept.append(i)
-            alive &= ~rival[i]
-            if len(kept) == max_objects:
-                break
-    weight = (overlap[kept] > SAME_BOX_IOU) * score
+    standing: list[float] = []
+    left = score.clone()
+    while len(kept) < min(max_objects, len(boxes)):
+        best = int(left.argmax())
+        if left[best] <= score_threshold:
+            break
+        kept.append(best)
+        standing.append(float(left[best]))
+        left = torch.where(overlap[best] > iou_threshold, left * (1 - overlap[best]), left)
+        left[same[best]] = 0.0
+        left[best] = 0.0
+    weight = same[kept] * score
     mean = weight @ boxes / weight.sum(1, keepdim=True)
-    return mean, score[kept], label[kept]
+    return mean, score.new_tensor(standing), label[kept]
 
 
 def _twice(x: Tensor) -> Tensor:

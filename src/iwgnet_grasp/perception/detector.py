@@ -55,9 +55,10 @@ class Detector:
         fitted, fit = letterbox(color, self.input_size, self.region)
         logits = self._run(np.ascontiguousarray(fitted.transpose(2, 0, 1))[None])
         with torch.inference_mode():
-            boxes, scores = decode([torch.from_numpy(m) for m in logits], self.anchors)
+            maps = [torch.from_numpy(m) for m in logits]
+            ((boxes, scores),) = decode(maps, self.anchors, self.score_threshold)
             corners, score, label = non_maximum_suppression(
-                boxes[0], scores[0], self.score_threshold, self.iou_threshold, self.max_objects
+                boxes, scores, self.score_threshold, self.iou_threshold, self.max_objects
             )
         height, width = color.shape[:2]
         detections = []

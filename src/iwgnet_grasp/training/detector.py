@@ -40,7 +40,7 @@ from iwgnet_grasp.training.detector_metrics import ImageBoxes, average_precision
 
 PACKAGE = Path(__file__).resolve().parents[3]
 DEFAULT_CONFIG = PACKAGE / "config" / "detector_training.yaml"
-IOU_THRESHOLD = 0.7  # of the suppression, as in config/perception.yaml
+IOU_THRESHOLD = 0.6  # of the suppression, as in config/perception.yaml
 
 Anchors = tuple[tuple[tuple[float, float], ...], ...]  # (width, height) px, three a scale
 
@@ -321,9 +321,9 @@ def compare(
 ) -> tuple[list[ImageBoxes], list[ImageBoxes]]:
     """The true boxes and the found ones of a batch from data.detection.collate, in input px."""
     truth, found = [], []
-    boxes, scores = decode(model(network_input(images)), model.anchors)
-    for i in range(len(images)):
-        best = non_maximum_suppression(boxes[i], scores[i], 0.01, IOU_THRESHOLD, 100)
+    decoded = decode(model(network_input(images)), model.anchors, 0.01)
+    for i, (boxes, scores) in enumerate(decoded):
+        best = non_maximum_suppression(boxes, scores, 0.01, IOU_THRESHOLD, 100)
         found.append(ImageBoxes(*(_array(best[k]) for k in (0, 2, 1))))
         mine = targets[targets[:, 0] == i]
         low, size = mine[:, 2:4] - mine[:, 4:] / 2, mine[:, 4:]
