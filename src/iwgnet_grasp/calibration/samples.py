@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from iwgnet_grasp.calibration.settings import CalibrationError, as_yaml, core, matrix
-from iwgnet_grasp.networks.weights import write_whole
+from iwgnet_grasp.files import write_whole
 
 
 @dataclass(frozen=True)
