@@ -190,8 +190,8 @@ def markdown(images: dict[str, list[dict[str, Any]]], pairs: dict[str, Any]) -> 
         )
     lines += [
         "",
-        "OpenCV's Tsai, Horaud and Daniilidis give wrong transforms for poses that are turned "
-        "against each other by about 180 deg, as some of the routine's are.",
+        "OpenCV's Tsai, Horaud and Daniilidis break down when poses are turned against each other "
+        "by more than 120 to 150 deg, as many of the routine's are; with less they are sound.",
         "",
         f"**Pairs with noise**: {POSES} simulated pairs, 0.5 mm and 0.1 deg along and about each "
         f"axis, {pairs['draws']} draws.",
