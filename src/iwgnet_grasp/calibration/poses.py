@@ -106,7 +106,7 @@ class PosePlanner:
             @ _about("y", tilt)
             @ _about("z", turn - toward)
         )
-        T[:3, 3] = random.uniform(s.min, s.max)
+        T[:3, 3] = random.uniform(s.board_min, s.board_max)
         points = self._print_points(T)
         if not self._in_view(points):
             return None

@@ -15,7 +15,6 @@ from iwgnet_grasp.calibration.samples import Sample, SampleSet
 from iwgnet_grasp.calibration.settings import CalibrationError, Settings, core
 
 SOURCES = ("images", "simulated_poses")
-MIN_POSES = 4  # three motions, one more than the equations need
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ class Settings:
     plate_size: np.ndarray  # (3,)
     T_tool_board: np.ndarray  # (4, 4), nominal
     start_joints: np.ndarray  # (6,)
-    min: np.ndarray  # (3,)
-    max: np.ndarray  # (3,)
+    board_min: np.ndarray  # (3,), where its middle is shown
+    board_max: np.ndarray  # (3,)
     tilt: tuple[float, float]
     margin_px: float
     max_velocity: float
@@ -61,8 +61,8 @@ def load_settings(config_dir: Path = PACKAGE / "config") -> Settings:
             plate_size=_vector(plate["size"], 3),
             T_tool_board=matrix(rig["T_tool_board"]),
             start_joints=_vector(rig["start_joints"], 6),
-            min=_vector(poses["min"], 3),
-            max=_vector(poses["max"], 3),
+            board_min=_vector(poses["min"], 3),
+            board_max=_vector(poses["max"], 3),
             tilt=(float(poses["tilt"][0]), float(poses["tilt"][1])),
             margin_px=float(poses["margin_px"]),
             max_velocity=float(poses["max_velocity"]),
