@@ -33,9 +33,9 @@ def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
 def merge(depth: np.ndarray, empty_depth: np.ndarray, box: Box) -> np.ndarray:
     """The empty scene's depth with the box's part of `depth` pasted in (Fig. 8b), (H, W) m.
 
-    Beyond the paper, what lies outside the box is kept as an obstacle, mirrored at the empty scene:
-    a neighbour becomes a pit as deep as it is high. The network sees what bars fingers and palm (the
-    2F-85 reaches 75 mm beyond the grasp) and cannot take it for the object.
+    Beyond the paper, what lies outside the box is kept as an obstacle, mirrored at the empty
+    scene: a neighbour becomes a pit as deep as it is high. The network sees what bars fingers and
+    palm (the 2F-85 reaches 75 mm beyond the grasp) and cannot take it for the object.
     A pixel of the box that was not measured stays NaN: the grasp network fills holes itself, in
     the same way as it did in training. A pixel that only the empty scene lacks stays NaN too;
     outside the box an unmeasured pixel shows the empty scene.
