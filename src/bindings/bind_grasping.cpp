@@ -21,7 +21,7 @@ void bind_grasping(py::module_& m) {
                               to_pose(T_base_camera, "T_base_camera"), cell, resolution, border);
            }),
            "depth"_a, "camera"_a, "T_base_camera"_a, "cell"_a, "resolution"_a = 0.002,
-           "border"_a = 0.05,
+           "border"_a = 0.11,
            "depth: (H, W) float32 m of `camera`; resolution and border of the grid in m.")
       .def("at", &HeightMap::at, "x"_a, "y"_a, "Height in m at (x, y) m in base_link.")
       .def("max_in", &HeightMap::max_in, "center"_a, "yaw"_a, "half"_a,
@@ -54,6 +54,8 @@ void bind_grasping(py::module_& m) {
       .def_readwrite("width", &GraspPose::width, "m, expected gap on the object (Eq. 5)")
       .def_readwrite("opening", &GraspPose::opening, "m, gap to approach with")
       .def_readwrite("quality", &GraspPose::quality)
+      .def_readonly("engagement", &GraspPose::engagement, "m, overlap of finger and object")
+      .def_readonly("candidate", &GraspPose::candidate, "which of best_grasp_pose()'s grasps it is")
       .def_readwrite("feasible", &GraspPose::feasible)
       .def_readwrite("reason", &GraspPose::reason, "one line, when not feasible");
 
@@ -77,7 +79,8 @@ void bind_grasping(py::module_& m) {
                                     cell, config);
       },
       "grasp"_a, "camera"_a, "T_base_camera"_a, "heights"_a, "cell"_a, "config"_a,
-      "Pixel -> camera -> base -> pose (section 2.2, Eq. 5). Not feasible: GraspPose.reason.");
+      "Pixel -> camera -> base -> pose (section 2.2, Eq. 5), straight down. Not feasible: "
+      "GraspPose.reason.");
   m.def(
       "best_grasp_pose",
       [](const std::vector<GraspRectangle>& grasps, const PinholeIntrinsics& camera,
@@ -87,7 +90,8 @@ void bind_grasping(py::module_& m) {
                                          heights, cell, config);
       },
       "grasps"_a, "camera"_a, "T_base_camera"_a, "heights"_a, "cell"_a, "config"_a,
-      "The first feasible pose of the candidates (best first), else the first with its reason.");
+      "The best feasible pose of the candidates, leaning with the object; else the first with its "
+      "reason.");
 }
 
 }  // namespace iwgnet_grasp::bindings

@@ -21,6 +21,16 @@ constexpr double kSurfaceShare = 0.8;     // of the band's heights lie below wha
 // Fingers are looked for outside this share of the predicted width; nearer to the centre a free
 // place is a bore or a recess of the object itself.
 constexpr double kCoreShare = 0.7;
+// Slope of the object's upper side.
+constexpr double kPatchHalf = 0.012;      // m across the closing line, of the patch that is fitted
+constexpr double kPlaneTolerance = 0.0015;  // m, 3 sigma of depth
+constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surface is something else
+constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
+constexpr int kPlaneTrials = 200;
+constexpr double kSnug = 0.004;           // m, noise of depth and of the network's width
+constexpr double kView = 0.09;            // m around a grasp, what the gripper's body reaches
+constexpr double kPitchScale = 3.0;       // a part that leans along the pads is held as flat: its
+                                          // angle counts by so much less
 
 struct GraspAxes {
   Eigen::Vector2d center, along, across;  // base_link, m
@@ -96,8 +106,9 @@ double tip_height_at(int gap) {
 // every gap. A finger meets the highest point over the pad's width and some play.
 class Clearance {
  public:
+  // floor: no tip goes below it.
   Clearance(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
-            int first_gap, int last_gap)
+            int first_gap, int last_gap, double floor)
       : first_(first_gap) {
     const double step = heights.resolution();
     const double half = kinematics::kPadWidth / 2 + config.side_clearance;
@@ -110,7 +121,7 @@ class Clearance {
     for (int side = 0; side < 2; ++side) {
       for (int i = begin; i <= end; ++i) {
         const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step);
-        double highest = 0.0;
+        double highest = floor;
         for (int j = -across; j <= across; ++j) {
           const Eigen::Vector2d q = p + axes.across * (half * j / across);
           highest = std::max(highest, heights.at(q.x(), q.y()));
@@ -119,7 +130,7 @@ class Clearance {
       }
       for (int gap = first_gap; gap <= last_gap; ++gap) {
         const double face = gap * kStep / 2;
-        double lowest_tip = 0.0;
+        double lowest_tip = floor;
         for (int i = static_cast<int>(std::ceil(face / step - 1e-9)); i <= end; ++i) {
           const double rise = underside(config, i * step - face);
           if (!std::isfinite(rise)) break;
@@ -148,18 +159,20 @@ std::string millimetres(double metres) {
 
 struct Descent {
   bool found = false;
-  double tip, closed, opening;  // m: tips' height once closed, that gap, gap to approach with
+  // m: tips' height once closed, that gap, gap to approach with, least gap at which both fingers
+  // stand free
+  double tip, closed, opening, contact;
 };
 
-// Deepest position of the tips at which both fingers find room.
+// Deepest position of the tips at which both fingers find room. `floor` is the table's height.
 Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
-                double surface, double width) {
+                double surface, double width, double floor) {
   const auto steps = [](double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); };
   const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
   const int expected = steps(width);
-  const Clearance clearance(heights, axes, config, first, widest);
+  const Clearance clearance(heights, axes, config, first, widest, floor);
   for (double engaged = config.insertion_depth; engaged >= config.min_engagement - 1e-9;
        engaged -= kStep) {
     const double tip = surface - engaged;
@@ -173,12 +186,98 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
     // Beside a shoulder of the object they may still close to the expected width, and sink.
     const int closed = std::min(contact, expected);
     const double lowest = tip - (tip_height_at(closed) - tip_height_at(contact));
-    if (lowest < config.floor_clearance) continue;
+    if (lowest < floor + config.floor_clearance) continue;
     int opening = contact;
     while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
-    if (opening >= contact + play) return {true, lowest, closed * kStep, opening * kStep};
+    if (opening >= contact + play) return {true, lowest, closed * kStep, opening * kStep, contact * kStep};
   }
   return {};
+}
+
+// Stages 1 and 2: where the grasp lies in the base frame. pose.reason says why it has no place.
+struct Located {
+  GraspPose pose;  // width and quality
+  GraspAxes axes;
+  double surface = 0.0;  // m over the table
+};
+
+Located locate(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+               const Pose& T_base_camera, const HeightMap& heights, const CellConfig& cell,
+               const GraspPoseConfig& config) {
+  Located located;
+  GraspPose& pose = located.pose;
+  GraspAxes& axes = located.axes;
+  pose.quality = grasp.quality;
+  const auto infeasible = [&](std::string reason) {
+    pose.reason = std::move(reason);
+    return located;
+  };
+  const bool finite = std::isfinite(grasp.x_px) && std::isfinite(grasp.y_px) &&
+                      std::isfinite(grasp.theta_rad) && std::isfinite(grasp.width_px);
+  if (!finite || grasp.width_px <= 0) return infeasible("grasp has no position, angle or width");
+  if (grasp.x_px < 0 || grasp.y_px < 0 || grasp.x_px > camera.width - 1 ||
+      grasp.y_px > camera.height - 1)
+    return infeasible("grasp lies outside the image");
+  if (heights.grid().empty()) return infeasible("no depth: the height map is empty");
+
+  // Pixel -> camera -> base. The measured depth starts the search for the surface; the height map
+  // then replaces it where it is missing, noisy or looks through a bore.
+  const bool measured = std::isfinite(grasp.depth_m) && grasp.depth_m > 0;
+  double surface = measured ? to_base(camera, T_base_camera, grasp.x_px, grasp.y_px, grasp.depth_m).z()
+                            : config.min_engagement + config.floor_clearance;
+  for (int i = 0; i < 3; ++i) {
+    axes = axes_at(grasp, camera, T_base_camera, surface);
+    const double depth =
+        (T_base_camera.inverse() * Eigen::Vector3d(axes.center.x(), axes.center.y(), surface)).z();
+    if (!(depth > 0)) return infeasible("the surface at the grasp is not in front of the camera");
+    pose.width = width_in_metres(grasp.width_px, depth, camera.fx);
+    surface = surface_height(heights, axes, std::min(pose.width, config.max_opening));
+  }
+  axes = axes_at(grasp, camera, T_base_camera, surface);
+  located.surface = surface;
+  const Eigen::Vector2d low = cell.workspace_min.array() - config.border;
+  const Eigen::Vector2d high = cell.workspace_max.array() + config.border;
+  if ((axes.center.array() < low.array()).any() || (axes.center.array() > high.array()).any())
+    return infeasible("grasp lies outside the workspace");
+  if (pose.width > config.max_opening)
+    return infeasible("object is " + millimetres(pose.width) + " wide there, the gripper opens " +
+                      millimetres(config.max_opening));
+  if (surface < config.min_engagement + config.floor_clearance)
+    return infeasible("nothing high enough to grip at the grasp point: surface is " +
+                      millimetres(surface) + " above the table");
+  return located;
+}
+
+// Stage 3: depth and opening, in a frame whose z axis points back along the approach. heights, axes
+// and surface are seen in it.
+void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
+           const GraspAxes& axes, double surface, double floor, const GraspPoseConfig& config) {
+  const auto infeasible = [&](std::string reason) { pose.reason = std::move(reason); };
+  const Descent descent = descend(heights, axes, config, surface, pose.width, floor);
+  if (!descent.found) return infeasible("fingers find no room beside the object");
+  const double yaw = std::atan2(axes.along.y(), axes.along.x());
+  const double open_tip =
+      descent.tip + finger_tip_height(descent.closed) - finger_tip_height(descent.opening);
+  // The body is lowest over the scene when the fingers have closed and the tool is at its depth;
+  // it does not move between: open tips measure it.
+  for (const GripperBody& body : config.body)
+    if (heights.max_in(axes.center, yaw, body.half) + config.floor_clearance >
+        open_tip + body.above_tips)
+      return infeasible("the gripper's body would touch what lies beside the object");
+
+  pose.opening = descent.opening;
+  pose.contact = descent.contact;
+  pose.engagement = surface - descent.tip;
+  const double tool_height = descent.tip + finger_tip_height(descent.closed);
+  Pose T_view_tcp = Pose::Identity();
+  T_view_tcp.translation() << axes.center, tool_height - kinematics::pad_center_height(pose.width);
+  T_view_tcp.linear().col(0) << axes.along, 0.0;
+  T_view_tcp.linear().col(1) << axes.along.y(), -axes.along.x(), 0.0;
+  T_view_tcp.linear().col(2) << 0.0, 0.0, -1.0;
+  pose.T_base_tcp = T_base_view * T_view_tcp;
+  pose.tip_height = (T_base_view * Eigen::Vector3d(axes.center.x(), axes.center.y(), descent.tip)).z();
+  pose.feasible = true;
+  pose.reason.clear();
 }
 
 }  // namespace
@@ -198,6 +297,10 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.min_engagement = positive("min_engagement");
   config.floor_clearance = positive("floor_clearance");
   config.border = file.get<double>("pose.border");
+  config.max_tilt = positive("max_tilt");
+  config.min_tilt = positive("min_tilt");
+  config.misalignment_scale = positive("misalignment_scale");
+  config.spread_scale = positive("spread_scale");
   config.finger_thickness = positive("finger_thickness");
   if (config.min_engagement > config.insertion_depth)
     file.fail("pose.min_engagement", "must not exceed insertion_depth");
@@ -225,89 +328,138 @@ double width_in_metres(double width_px, double depth_m, double fx_px) {
   return depth_m * width_px / fx_px;
 }
 
+// RANSAC (Fischler and Bolles 1981), then least squares.
+Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
+                    const Eigen::Vector2d& along, double surface, double width, double max_tilt) {
+  const Eigen::Vector2d across(-along.y(), along.x());
+  const double step = heights.resolution(), steepest = std::tan(max_tilt);
+  const int n = std::max(2, static_cast<int>(width / 2 / step));
+  const int m = static_cast<int>(kPatchHalf / step);
+  std::vector<Eigen::Vector3d> points;  // along, across, over the surface
+  for (int i = -n; i <= n; ++i)
+    for (int j = -m; j <= m; ++j) {
+      const Eigen::Vector2d p = center + along * (i * step) + across * (j * step);
+      points.emplace_back(i * step, j * step, heights.at(p.x(), p.y()) - surface);
+    }
+  const auto count = static_cast<std::uint32_t>(points.size());
+  std::uint32_t state = 1;
+  const auto draw = [&] {  // Numerical Recipes' linear congruential generator
+    state = state * 1664525u + 1013904223u;
+    return points[(static_cast<std::uint64_t>(state) * count) >> 32];
+  };
+  Eigen::Vector3d best = Eigen::Vector3d::Zero();  // slopes and height at the grasp
+  int most = 0;
+  const auto lies_in = [](const Eigen::Vector3d& plane, const Eigen::Vector3d& p) {
+    return std::abs(plane.x() * p.x() + plane.y() * p.y() + plane.z() - p.z()) < kPlaneTolerance;
+  };
+  for (int trial = 0; trial < kPlaneTrials; ++trial) {
+    const Eigen::Vector3d a = draw(), b = draw(), c = draw();
+    const Eigen::Vector3d normal = (b - a).cross(c - a);
+    if (std::abs(normal.z()) < 1e-5) continue;  // m^2: a sliver
+    Eigen::Vector3d plane(-normal.x() / normal.z(), -normal.y() / normal.z(), 0.0);
+    plane.z() = a.z() - plane.x() * a.x() - plane.y() * a.y();
+    if (plane.head<2>().norm() > steepest || plane.z() < -kPlaneBelow) continue;
+    const int inliers = static_cast<int>(std::count_if(
+        points.begin(), points.end(), [&](const Eigen::Vector3d& p) { return lies_in(plane, p); }));
+    if (inliers > most) {
+      most = inliers;
+      best = plane;
+    }
+  }
+  if (most < kPlaneShare * count) return {};
+  for (int pass = 0; pass < 2; ++pass) {
+    Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
+    Eigen::Vector3d right = Eigen::Vector3d::Zero();
+    for (const Eigen::Vector3d& p : points) {
+      if (!lies_in(best, p)) continue;
+      const Eigen::Vector3d row(p.x(), p.y(), 1.0);
+      normal += row * row.transpose();
+      right += row * p.z();
+    }
+    best = normal.ldlt().solve(right);
+  }
+  if (!best.allFinite() || best.head<2>().norm() > steepest) return {};
+  return {best.x(), best.y()};
+}
+
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                      const Pose& T_base_camera, const HeightMap& heights,
                      const CellConfig& cell, const GraspPoseConfig& config) {
-  GraspPose pose;
-  pose.quality = grasp.quality;
-  const auto infeasible = [&](std::string reason) {
-    pose.feasible = false;
-    pose.reason = std::move(reason);
-    return pose;
+  Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
+  if (located.pose.reason.empty())
+    lower(located.pose, Pose::Identity(), heights, located.axes, located.surface, 0.0, config);
+  return located.pose;
+}
+
+GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+                             const Pose& T_base_camera, const HeightMap& heights,
+                             const CellConfig& cell, const GraspPoseConfig& config) {
+  const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
+  if (!located.pose.reason.empty()) return located.pose;
+  const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
+                                    std::min(located.pose.width, config.max_opening), config.max_tilt);
+  const double roll = std::atan(slope.along), pitch = std::atan(slope.across);
+
+  struct Lean {
+    double roll, pitch, quality;
   };
-  const bool finite = std::isfinite(grasp.x_px) && std::isfinite(grasp.y_px) &&
-                      std::isfinite(grasp.theta_rad) && std::isfinite(grasp.width_px);
-  if (!finite || grasp.width_px <= 0) return infeasible("grasp has no position, angle or width");
-  if (grasp.x_px < 0 || grasp.y_px < 0 || grasp.x_px > camera.width - 1 ||
-      grasp.y_px > camera.height - 1)
-    return infeasible("grasp lies outside the image");
-  if (heights.grid().empty()) return infeasible("no depth: the height map is empty");
+  std::vector<Lean> leans;
+  const auto add = [&](double roll_share, double pitch_share) {
+    const double roll_left = (1 - roll_share) * roll, pitch_left = (1 - pitch_share) * pitch / kPitchScale;
+    const double left = std::hypot(roll_left, pitch_left) / config.misalignment_scale;
+    leans.push_back({roll_share * roll, pitch_share * pitch, std::exp(-left * left)});
+  };
+  const bool rolled = std::abs(roll) > config.min_tilt, pitched = std::abs(pitch) > config.min_tilt;
+  for (const double roll_share : {1.0, 0.5, 0.0})
+    for (const double pitch_share : {1.0, 0.5, 0.0})
+      if ((rolled || roll_share == 0.0) && (pitched || pitch_share == 0.0)) add(roll_share, pitch_share);
+  std::stable_sort(leans.begin(), leans.end(),
+                   [](const Lean& a, const Lean& b) { return a.quality > b.quality; });
 
-  // Stages 1 and 2, pixel -> camera -> base. The measured depth starts the search for the surface;
-  // the height map then replaces it where it is missing, noisy or looks through a bore.
-  const bool measured = std::isfinite(grasp.depth_m) && grasp.depth_m > 0;
-  double surface = measured ? to_base(camera, T_base_camera, grasp.x_px, grasp.y_px, grasp.depth_m).z()
-                            : config.min_engagement + config.floor_clearance;
-  GraspAxes axes;
-  for (int i = 0; i < 3; ++i) {
-    axes = axes_at(grasp, camera, T_base_camera, surface);
-    const double depth =
-        (T_base_camera.inverse() * Eigen::Vector3d(axes.center.x(), axes.center.y(), surface)).z();
-    if (!(depth > 0)) return infeasible("the surface at the grasp is not in front of the camera");
-    pose.width = width_in_metres(grasp.width_px, depth, camera.fx);
-    surface = surface_height(heights, axes, std::min(pose.width, config.max_opening));
+  const Eigen::Vector3d at(located.axes.center.x(), located.axes.center.y(), located.surface);
+  GraspPose first;
+  for (const Lean& lean : leans) {
+    GraspPose pose = located.pose;
+    pose.quality *= lean.quality;
+    if (lean.roll == 0.0 && lean.pitch == 0.0) {
+      lower(pose, Pose::Identity(), heights, located.axes, located.surface, 0.0, config);
+    } else {
+      // x along the closing direction and y along the pads, both in the surface.
+      Pose T_base_view(Eigen::Translation3d(at.x(), at.y(), at.z()));
+      const Eigen::Vector3d x(located.axes.along.x(), located.axes.along.y(), std::tan(lean.roll));
+      const Eigen::Vector3d y(located.axes.across.x(), located.axes.across.y(), std::tan(lean.pitch));
+      T_base_view.linear().col(0) = x.normalized();
+      T_base_view.linear().col(2) = x.cross(y).normalized();
+      T_base_view.linear().col(1) = T_base_view.linear().col(2).cross(T_base_view.linear().col(0));
+      const HeightMap view = heights.seen_from(T_base_view, kView);
+      const GraspAxes axes{{0, 0}, {1, 0}, {0, 1}};
+      const double surface = surface_height(view, axes, std::min(pose.width, config.max_opening));
+      const double table = -at.z() / T_base_view.linear()(2, 2);
+      lower(pose, T_base_view, view, axes, surface, table, config);
+    }
+    if (pose.feasible) {
+      const double beside = std::max(0.0, pose.contact - pose.width - kSnug) / config.spread_scale;
+      pose.quality *= std::exp(-beside * beside);
+      return pose;
+    }
+    if (first.reason.empty()) first = pose;
   }
-  axes = axes_at(grasp, camera, T_base_camera, surface);
-  const Eigen::Vector2d low = cell.workspace_min.array() - config.border;
-  const Eigen::Vector2d high = cell.workspace_max.array() + config.border;
-  if ((axes.center.array() < low.array()).any() || (axes.center.array() > high.array()).any())
-    return infeasible("grasp lies outside the workspace");
-  if (pose.width > config.max_opening)
-    return infeasible("object is " + millimetres(pose.width) + " wide there, the gripper opens " +
-                      millimetres(config.max_opening));
-  if (surface < config.min_engagement + config.floor_clearance)
-    return infeasible("nothing high enough to grip at the grasp point: surface is " +
-                      millimetres(surface) + " above the table");
-
-  // Stage 3: depth and opening.
-  const Descent descent = descend(heights, axes, config, surface, pose.width);
-  if (!descent.found) return infeasible("fingers find no room beside the object");
-  const double yaw = std::atan2(axes.along.y(), axes.along.x());
-  const double open_tip =
-      descent.tip + finger_tip_height(descent.closed) - finger_tip_height(descent.opening);
-  // The body is lowest over the scene when the fingers have closed and the tool is at its depth;
-  // it does not move between: open tips measure it.
-  for (const GripperBody& body : config.body)
-    if (heights.max_in(axes.center, yaw, body.half) + config.floor_clearance >
-        open_tip + body.above_tips)
-      return infeasible("the gripper's body would touch what lies beside the object");
-
-  pose.opening = descent.opening;
-  pose.tip_height = descent.tip;
-  pose.engagement = surface - descent.tip;
-  const double tool_height = descent.tip + finger_tip_height(descent.closed);
-  pose.T_base_tcp.translation() << axes.center,
-      tool_height - kinematics::pad_center_height(pose.width);
-  pose.T_base_tcp.linear().col(0) << axes.along, 0.0;
-  pose.T_base_tcp.linear().col(1) << axes.along.y(), -axes.along.x(), 0.0;
-  pose.T_base_tcp.linear().col(2) << 0.0, 0.0, -1.0;
-  pose.feasible = true;
-  return pose;
+  return first;
 }
 
 GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
                           const PinholeIntrinsics& camera, const Pose& T_base_camera,
                           const HeightMap& heights, const CellConfig& cell,
                           const GraspPoseConfig& config) {
-  GraspPose first;
-  first.reason = "no grasp was found for the object";
+  GraspPose best;
+  best.reason = "no grasp was found for the object";
   for (std::size_t i = 0; i < candidates.size(); ++i) {
-    GraspPose pose = grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config);
+    GraspPose pose = aligned_grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config);
     pose.candidate = static_cast<int>(i);
-    if (pose.feasible) return pose;
-    if (i == 0) first = std::move(pose);
+    if (i == 0 || (pose.feasible && (!best.feasible || pose.quality > best.quality)))
+      best = std::move(pose);
   }
-  return first;
+  return best;
 }
 
 }  // namespace iwgnet_grasp::grasping

@@ -106,12 +106,53 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
   fill_unknown(grid_);
 }
 
+HeightMap HeightMap::seen_from(const Pose& T_base_view, double half) const {
+  HeightMap view;
+  view.resolution_ = resolution_;
+  view.outside_ = -std::numeric_limits<double>::infinity();
+  view.origin_.setConstant(-half + resolution_ / 2);
+  const int size = static_cast<int>(std::ceil(2 * half / resolution_));
+  view.grid_.create(size, size, CV_32FC1);
+  view.grid_.setTo(kUnknown);
+  const Pose T_view_base = T_base_view.inverse();
+  // A point that the view shows may lie this far beside it on the table.
+  const Eigen::Vector2d center = T_base_view.translation().head<2>();
+  const double reach = half * M_SQRT2 + kTallest * T_base_view.linear().col(2).head<2>().norm();
+  const auto index = [&](double value, double origin, int last) {
+    return std::clamp(static_cast<int>((value - origin) / resolution_), 0, last);
+  };
+  const int c0 = index(center.x() - reach, origin_.x(), grid_.cols - 1);
+  const int c1 = index(center.x() + reach, origin_.x(), grid_.cols - 1);
+  const int r0 = index(center.y() - reach, origin_.y(), grid_.rows - 1);
+  const int r1 = index(center.y() + reach, origin_.y(), grid_.rows - 1);
+  for (int r = r0; r <= r1 && !grid_.empty(); ++r)
+    for (int c = c0; c <= c1; ++c) {
+      const float top = grid_.at<float>(r, c);
+      // Down to the lowest neighbour: the wall of a step is seen from the side.
+      float low = top;
+      for (const auto& [dr, dc] : {std::pair{-1, 0}, {1, 0}, {0, -1}, {0, 1}})
+        if (r + dr >= 0 && r + dr < grid_.rows && c + dc >= 0 && c + dc < grid_.cols)
+          low = std::min(low, grid_.at<float>(r + dr, c + dc));
+      for (double z = top; z >= low; z -= resolution_) {
+        const Eigen::Vector3d p = T_view_base * Eigen::Vector3d(origin_.x() + c * resolution_,
+                                                                origin_.y() + r * resolution_, z);
+        const int column = static_cast<int>(std::floor((p.x() + half) / resolution_));
+        const int row = static_cast<int>(std::floor((p.y() + half) / resolution_));
+        if (column < 0 || row < 0 || column >= size || row >= size) continue;
+        float& height = view.grid_.at<float>(row, column);
+        height = std::max(height, static_cast<float>(p.z()));
+      }
+    }
+  fill_unknown(view.grid_);
+  return view;
+}
+
 double HeightMap::max_in(const Eigen::Vector2d& center, double yaw,
                          const Eigen::Vector2d& half) const {
   const Eigen::Vector2d along(std::cos(yaw), std::sin(yaw)), across(-along.y(), along.x());
   const int nx = std::max(1, static_cast<int>(std::ceil(2 * half.x() / resolution_)));
   const int ny = std::max(1, static_cast<int>(std::ceil(2 * half.y() / resolution_)));
-  double highest = 0.0;
+  double highest = outside_;
   for (int i = 0; i <= nx; ++i)
     for (int j = 0; j <= ny; ++j) {
       const Eigen::Vector2d p = center + along * (half.x() * (2.0 * i / nx - 1)) +

@@ -12,7 +12,7 @@ namespace {
 
 constexpr int kBlock = 8;              // cells a side of a block of the height map
 constexpr double kColumnRadius = 0.003;  // m
-constexpr double kColumnTilt = 0.9995;   // cosine of the tool's tilt that still counts as down
+constexpr double kColumnTilt = 0.9995;   // cosine of the tool's tilt that still counts as along it
 
 const char* const kBodyNames[] = {"base_link",     "shoulder_link", "upper_arm_link", "forearm_link",
                                   "wrist_1_link",  "wrist_2_link",  "wrist_3_link",   "gripper",
@@ -106,7 +106,7 @@ void CollisionWorld::set_attached(const std::vector<AttachedPart>& pieces) {
   rebuild();
 }
 
-void CollisionWorld::set_columns(const std::vector<Eigen::Vector2d>& columns) { columns_ = columns; }
+void CollisionWorld::set_columns(const std::vector<Column>& columns) { columns_ = columns; }
 
 // Sphere sizes: fitted to the collision meshes of ur_description and of the 2F-85, which they cover
 // (test_motion_collision).
@@ -205,10 +205,10 @@ void CollisionWorld::place(Body body, const Frames& frames, Placed& placed) cons
 }
 
 bool CollisionWorld::in_column(const Pose& T_base_tool0) const {
-  if (-T_base_tool0(2, 2) < kColumnTilt) return false;
-  const Eigen::Vector2d tool = T_base_tool0.translation().head<2>();
-  return std::any_of(columns_.begin(), columns_.end(), [&](const Eigen::Vector2d& column) {
-    return (tool - column).norm() < kColumnRadius;
+  const Eigen::Vector3d pointing = T_base_tool0.linear().col(2);
+  return std::any_of(columns_.begin(), columns_.end(), [&](const Column& column) {
+    return pointing.dot(column.axis) > kColumnTilt &&
+           (T_base_tool0.translation() - column.point).cross(column.axis).norm() < kColumnRadius;
   });
 }
 

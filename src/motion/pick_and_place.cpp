@@ -20,11 +20,11 @@ using Clock = std::chrono::steady_clock;
 constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is where it was sent
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
-constexpr double kFarthestCentroid = 0.08;  // m from the grasp point: half a part; more is an error
-constexpr double kLengthwise = 0.015;    // m from grasp to centroid along the closing direction: held lengthwise
-constexpr double kSlopeReach = 0.030;    // m beside the grasp where the part's slope is measured
-constexpr double kFarCentroid = 0.020;   // m from the grasp: far enough to give a slope
-constexpr double kSameSurface = 0.006;   // m, steps of a part's upper side
+constexpr double kFarthestCentroid = 0.03;  // m from the grasp point: farther out nothing is gripped
+constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
+constexpr double kMiddle = 0.004;        // m along the closing direction: farther out is beside the middle
+constexpr double kMiddleLength = 0.008;  // m across it
+constexpr double kRecess = 0.0035;       // m, a recess is deeper
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
@@ -48,8 +48,9 @@ JointPath reversed(JointPath path) {
   return path;
 }
 
-Pose raised(Pose T, double height) {
-  T.translation().z() += height;
+// Back along the approach.
+Pose raised(Pose T, double distance) {
+  T.translation() -= distance * T.linear().col(2);
   return T;
 }
 
@@ -156,6 +157,7 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.held_thickness = positive("held_part.thickness");
   config.release_margin = positive("release_margin");
   config.release_height = positive("release_height");
+  config.held_height = positive("held_part.height");
   return config;
 }
 
@@ -167,35 +169,63 @@ void PickAndPlace::set_heights(const grasping::HeightMap& heights) {
   world_.set_heights(heights);
 }
 
-double PickAndPlace::hang(const Pose& T_base_tcp, const Eigen::Vector2d& along,
-                          const Eigen::Vector3d& centroid) const {
-  const Eigen::Vector3d at = T_base_tcp.translation();
-  const double tip = at.z() - kinematics::kPadHeight / 2;
-  const auto height = [&](double s) {
-    const Eigen::Vector2d p = at.head<2>() + s * along;
-    return heights_.at(p.x(), p.y());
+PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double width,
+                                               const Eigen::Vector3d& centroid) const {
+  HeldPart held;
+  // Seen by the gripper, which will point straight down over the tray: x closes, z is up.
+  Pose T_base_view = T_base_tcp;
+  T_base_view.linear().rightCols<2>() *= -1.0;
+  const grasping::HeightMap heights = heights_.seen_from(T_base_view, config_.held_reach);
+  const double tip = -kinematics::kPadHeight / 2;
+  const double surface = heights.max_in({0, 0}, 0.0, {0.006, 0.006});
+
+  const grasping::Slope slope =
+      grasping::surface_slope(heights, {0, 0}, {1, 0}, surface, width, std::atan(kSteepest));
+
+  // The pads stand at the part's sides: along the closing direction it is as long as the gap and
+  // centred. Across it, it goes on as long as its upper side does.
+  const auto profile = [&](double y) {
+    double highest = -1.0;
+    for (double x = -width / 2; x <= width / 2; x += heights.resolution())
+      highest = std::max(highest, heights.at(x, y) - slope.along * x - slope.across * y);
+    return highest;
   };
-  const double surface = heights_.max_in(at.head<2>(), std::atan2(along.y(), along.x()), {0.006, 0.006});
-  // Slope of the part's upper side, from what is near enough to the grasp's height to belong to it.
-  double ss = 0.0, sh = 0.0;
-  for (double s = 0.004; s <= kSlopeReach; s += 0.002)
-    for (const double side : {-s, s}) {
-      const double rise = height(side) - surface;
-      if (std::abs(rise) > kSameSurface + kSteepest * s) continue;
-      ss += s * s;
-      sh += side * rise;
-    }
-  const double offset = (centroid - at).head<2>().dot(along);
-  const auto drop = [&](double slope) {  // of the low end below the grasp
-    slope = std::clamp(slope, -kSteepest, kSteepest);
-    const double reach = config_.held_reach + (slope > 0 ? -offset : offset);
-    return std::abs(slope) * std::max(reach, 0.0);
-  };
-  double low = ss > 0.0 ? drop(sh / ss) : 0.0;
-  // A part gripped by its upper end shows its slope only between the grasp and its centroid.
-  if (std::abs(offset) > kFarCentroid && centroid.z() < surface)
-    low = std::max(low, drop((centroid.z() - surface) / offset));
-  return std::clamp(config_.held_thickness + low - (surface - tip), 0.0, std::max(tip, 0.0));
+  double ends[2];
+  for (const int side : {0, 1}) {
+    double y = 0.0;
+    while (y < config_.held_reach && profile(side ? y : -y) > surface - kUpperSide) y += heights.resolution();
+    ends[side] = y;
+  }
+  const double length = ends[0] + ends[1];
+  held.lengthwise = length < width;
+  // Where a neighbour goes on as the part does, its end is not seen: the centroid of all that is
+  // seen of it, as far as that can be, has to do.
+  const double center_y = (T_base_view.inverse() * centroid).y();
+  held.offset = length <= config_.held_length ? (ends[1] - ends[0]) / 2
+                                              : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
+  const double rise = held.lengthwise ? slope.along : slope.across;
+  const double offset = held.lengthwise ? 0.0 : held.offset;
+  const double low_end = std::abs(rise) * std::max(0.0, config_.held_reach + (rise > 0 ? -offset : offset));
+
+  // A rod that lies flat shows the recess of its shank or a bore midway between the pads, lower than
+  // what is beside it on both sides; one that stands on its edge does not, and reaches lower.
+  std::vector<double> dips;
+  for (double y = -kMiddleLength; y <= kMiddleLength; y += heights.resolution()) {
+    double sides[2] = {-1.0, -1.0};
+    for (double x = kMiddle; x <= width / 2 + kMiddle; x += heights.resolution())
+      for (const int side : {0, 1}) sides[side] = std::max(sides[side], heights.at(side ? x : -x, y));
+    dips.push_back(std::min(sides[0], sides[1]) - heights.at(0.0, y));
+  }
+  std::nth_element(dips.begin(), dips.begin() + dips.size() / 2, dips.end());
+  const bool flat = dips[dips.size() / 2] > kRecess;
+  const double thickness = flat ? config_.held_thickness : config_.held_height;
+
+  // No deeper than the table below the low end.
+  const Eigen::Vector3d tips = T_base_view * Eigen::Vector3d(0, 0, tip);
+  const double tilt = std::abs(T_base_view.linear()(2, held.lengthwise ? 0 : 1));
+  const double table = (tips.z() + config_.held_reach * tilt) / T_base_view.linear()(2, 2);
+  held.hang = std::clamp(thickness + low_end - (surface - tip), 0.0, std::clamp(table, 0.0, config_.held_height));
+  return held;
 }
 
 Trajectory PickAndPlace::timed(std::vector<PathLeg> legs, std::string& why) const {
@@ -228,7 +258,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
                                                ": it has " + std::to_string(slots.size()));
 
   const Eigen::Vector3d at = grasp.T_base_tcp.translation();
-  const Eigen::Vector2d grasp_column = at.head<2>();
+  const Column grasp_column(grasp.T_base_tcp);
   const double released = std::min(grasp.width + config_.release_margin, kinematics::max_gap());
 
   // Grasp.
@@ -243,14 +273,10 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
 
   // Slot: the part's long axis along y, its centroid over the slot's centre. The fingers close across
   // the long axis, unless they hold the part by its end from both sides along it.
-  Eigen::Vector3d offset = grasp.T_base_tcp.linear().transpose() * (request.centroid - at);
-  offset.z() = 0.0;
-  if (offset.norm() > kFarthestCentroid) offset *= kFarthestCentroid / offset.norm();
-  const bool lengthwise =
-      std::abs(offset.x()) > std::max(kLengthwise, std::abs(offset.y()));
-  const Eigen::Vector2d along =
-      grasp.T_base_tcp.linear().col(lengthwise ? 0 : 1).head<2>().normalized();
-  const double hang = this->hang(grasp.T_base_tcp, along, request.centroid);
+  const HeldPart seen = held_part(grasp.T_base_tcp, grasp.width, request.centroid);
+  const bool lengthwise = seen.lengthwise;
+  // In the TCP frame, whose y axis is the view's turned round.
+  const Eigen::Vector3d offset(0.0, lengthwise ? 0.0 : -seen.offset, 0.0);
   const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
   const Eigen::Vector3d slot = slots[request.tray_slot];
   const double inwards = cell_.tray.center.x() < slot.x() ? -1.0 : 1.0;
@@ -264,7 +290,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
       pose.translation() = slot - pose.linear() * centroid;
       pose.translation().x() += inwards * shift;
       pose.translation().z() =
-          cell_.tray.floor_height + config_.release_height + hang + kinematics::kPadHeight / 2;
+          cell_.tray.floor_height + config_.release_height + seen.hang + kinematics::kPadHeight / 2;
     }
     return poses;
   };
@@ -272,7 +298,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   struct Combination {
     const Reached* grasp;
     Reached slot;
-    Eigen::Vector2d slot_column;
+    Column slot_column;
     double cost;
   };
   std::vector<Combination> combinations;
@@ -281,12 +307,12 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   for (const double shift : {0.0, 0.01, 0.02}) {
     for (const Reached& g : grasps) {
       const auto poses = slot_poses(g.turn, shift);
-      world_.set_columns({poses[0].translation().head<2>(), poses[1].translation().head<2>()});
+      world_.set_columns({Column(poses[0]), Column(poses[1])});
       for (const Reached& s : reach(world_, poses, grasp.width, rise, g.high, config_.carry, why)) {
         const double cost = duration(start, g.high, config_.limits) +
                             duration(g.high, s.high, config_.carry) +
                             duration(s.high, cell_.observe_joints, config_.limits);
-        combinations.push_back({&g, s, poses[s.turn].translation().head<2>(), cost});
+        combinations.push_back({&g, s, Column(poses[s.turn]), cost});
       }
     }
     if (!combinations.empty()) break;
@@ -307,7 +333,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   const int tries = std::min<int>(kCombinations, static_cast<int>(combinations.size()));
   for (int i = 0; i < tries; ++i) {
     const Reached &g = *combinations[i].grasp, &s = combinations[i].slot;
-    const Eigen::Vector2d slot_column = combinations[i].slot_column;
+    const Column slot_column = combinations[i].slot_column;
     const auto leg = [&](const JointPath& path, const JointLimits& limits) {
       PathLeg result;
       result.path = path;

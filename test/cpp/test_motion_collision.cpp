@@ -119,7 +119,9 @@ TEST(CollisionWorld, PartsAreMetByTheirHeights) {
   EXPECT_FALSE(world.collides(tool_down(0.5, 0.0, 0.085)));
   EXPECT_FALSE(world.collides(tool_down(0.5, 0.18, 0.06)));
   // Onto the part itself the fingers go unchecked, the palm does not.
-  world.set_columns({Eigen::Vector2d(0.5, 0.0)});
+  Pose down(Eigen::Translation3d(0.5, 0.0, 0.02));
+  down.rotate(Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX()));
+  world.set_columns({Column(down)});
   EXPECT_FALSE(world.collides(over));
   EXPECT_FALSE(world.collides(tool_down(0.502, 0.0, 0.06)));
   EXPECT_TRUE(world.collides(tool_down(0.505, 0.0, 0.06)));

@@ -23,6 +23,7 @@ struct GraspPose {
   Pose T_base_tcp = Pose::Identity();
   double width = 0.0;                  // m, expected gap on the object (Eq. 5)
   double opening = 0.0;                // m, gap to approach with
+  double contact = 0.0;                // m, least gap at which the measured surface lets both fingers in
   double quality = 0.0;
   double tip_height = 0.0;             // m, finger tips over base_link's z = 0 once closed
   double engagement = 0.0;             // m, overlap of finger and object along the approach
@@ -44,12 +45,27 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double min_engagement;     // m, least overlap of finger and object
   double floor_clearance;    // m, finger tips above whatever lies under them
   double border;             // m, how far outside the workspace a grasp may lie
+  double max_tilt;           // rad, of the approach against the vertical
+  double min_tilt;           // rad, a surface that slopes less is taken for level
+  double misalignment_scale; // rad, between pads and object, at which quality has fallen to 1/e
+  double spread_scale;       // m that `contact` exceeds the width, likewise
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
   std::vector<Eigen::Vector2d> finger_outline;
   std::vector<GripperBody> body;
 };
 GraspPoseConfig load_grasp_pose_config(const std::string& config_dir);  // Throws Error.
+
+// Rise of a surface for each metre along and across the closing direction.
+struct Slope {
+  double along = 0.0, across = 0.0;
+};
+
+// Slope of an object's upper side: of the plane that holds most of what is seen between the jaws,
+// `width` apart along the unit vector `along`, and is not far below `surface` (m). Level when there
+// is none, or none up to max_tilt (rad).
+Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
+                    const Eigen::Vector2d& along, double surface, double width, double max_tilt);
 
 // Eq. 5: pixels to metres at depth z.
 double width_in_metres(double width_px, double depth_m, double fx_px);
@@ -63,7 +79,16 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
                      const Pose& T_base_camera, const HeightMap& heights,
                      const CellConfig& cell, const GraspPoseConfig& config);
 
-// The first feasible pose of the candidates (best first), else the first with its reason.
+// The same with an approach that follows the object: where its upper side slopes, the gripper leans
+// with it as far as what lies around it permits, so that both pads meet the object flat. A part that
+// is gripped by its edges turns between the pads as soon as it leaves the table. quality is the
+// network's, less what the angle left between pads and object and a neighbour that the fingers would
+// have to take along cost: each exp(-(amount / scale)^2).
+GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+                             const Pose& T_base_camera, const HeightMap& heights,
+                             const CellConfig& cell, const GraspPoseConfig& config);
+
+// The feasible aligned pose of the highest quality, else the first with its reason.
 GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
                           const PinholeIntrinsics& camera, const Pose& T_base_camera,
                           const HeightMap& heights, const CellConfig& cell,

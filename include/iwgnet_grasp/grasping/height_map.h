@@ -18,11 +18,15 @@ class HeightMap {
   HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,
             const CellConfig& cell, double resolution = 0.002, double border = 0.11);
 
+  // The same surface over the xy plane of another frame, `half` m around its origin, as heights along
+  // its z axis. What lies below a point of the surface is taken for solid. Outside: -infinity.
+  HeightMap seen_from(const Pose& T_base_view, double half) const;
+
   // m above base_link's z = 0; 0 outside the map.
   double at(double x, double y) const {
     const double column = (x - origin_.x()) / resolution_ + 0.5;
     const double row = (y - origin_.y()) / resolution_ + 0.5;
-    if (!(column >= 0.0 && row >= 0.0 && column < grid_.cols && row < grid_.rows)) return 0.0;
+    if (!(column >= 0.0 && row >= 0.0 && column < grid_.cols && row < grid_.rows)) return outside_;
     return grid_.ptr<float>(static_cast<int>(row))[static_cast<int>(column)];
   }
   // Highest value within an oriented rectangle: centre, yaw, half extents (m).
@@ -35,7 +39,7 @@ class HeightMap {
  private:
   cv::Mat grid_;
   Eigen::Vector2d origin_{0, 0};
-  double resolution_ = 0.002;
+  double resolution_ = 0.002, outside_ = 0.0;
 };
 
 }  // namespace iwgnet_grasp::grasping

@@ -20,6 +20,15 @@ struct AttachedPart {
   double radius;         // m
 };
 
+// The line along which the tool moves onto or off a part.
+struct Column {
+  Eigen::Vector3d point;                                // m, of tool0 in base_link
+  Eigen::Vector3d axis = -Eigen::Vector3d::UnitZ();     // unit, tool0's z axis on it
+
+  explicit Column(const Pose& T_base_tool)
+      : point(T_base_tool.translation()), axis(T_base_tool.linear().col(2)) {}
+};
+
 class CollisionWorld {
  public:
   // The arm's bodies in chain order; kHeldPart only while a part is attached.
@@ -42,10 +51,10 @@ class CollisionWorld {
   void set_gripper_gap(double gap);
   void set_attached(const std::optional<AttachedPart>& part);
   void set_attached(const std::vector<AttachedPart>& pieces);
-  // Within these columns (3 mm about x, y of tool0 in base_link) a gripper that points down moves
-  // straight onto or off a part: there its fingers and the held part are not checked against the
-  // heights, which the grasp pose has cleared already, nor the held part against anything.
-  void set_columns(const std::vector<Eigen::Vector2d>& columns);
+  // Within 3 mm of these lines, pointing along them, the gripper moves straight onto or off a part:
+  // there its fingers and the held part are not checked against the heights, which the grasp pose
+  // has cleared already, nor the held part against anything.
+  void set_columns(const std::vector<Column>& columns);
 
   bool collides(const JointVector& q) const;
   // Names of what touches what, e.g. "wrist_3_link - camera"; empty when free.
@@ -94,7 +103,7 @@ class CollisionWorld {
   Heights heights_;
   double gap_;
   std::vector<AttachedPart> attached_;
-  std::vector<Eigen::Vector2d> columns_;
+  std::vector<Column> columns_;
   std::vector<LocalSphere> spheres_;  // in the order of Body
   std::array<BodySpheres, kBodies> bodies_;
 };

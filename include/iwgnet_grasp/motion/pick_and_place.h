@@ -55,7 +55,7 @@ struct PickPlaceConfig {  // config/motion.yaml
   double held_gap_min;            // m, a smaller gap after closing means nothing is held
   double held_length, held_radius;  // m, capsule that stands for a held part
   double held_reach;              // m from a part's centroid to its far end, at most
-  double held_thickness;          // m, at most
+  double held_thickness, held_height;  // m, at most, lying flat and standing on its edge
   double release_margin;          // m, fingers open by this much beyond the object
   double release_height;          // m, part's lowest point above the tray floor when letting go
 };
@@ -106,11 +106,16 @@ class PickAndPlace {
   PickResult plan_pick(const JointVector& start, const PickRequest& request, PickPlan& plan);
 
  private:
-  // How far, m, the part that is grasped at the pose reaches below the finger tips: by its thickness
-  // and by the slope of what the heights show along its axis; no lower than the table. Used to let
-  // go of a tilted part before it meets the tray, and of a flat one not too high.
-  double hang(const Pose& T_base_tcp, const Eigen::Vector2d& along,
-              const Eigen::Vector3d& centroid) const;
+  // What the heights tell of the part that is grasped at the pose. It is laid into the tray by it.
+  struct HeldPart {
+    bool lengthwise = false;  // its long axis lies along the closing direction
+    double offset = 0.0;      // m from the grasp to its middle, across the closing direction, in the
+                              // direction of approach x closing
+    double hang = 0.0;        // m below the finger tips, at most: by its height, flat or on its edge,
+                              // and by the slope of its upper side against the gripper; no lower than
+                              // the table
+  };
+  HeldPart held_part(const Pose& T_base_tcp, double width, const Eigen::Vector3d& centroid) const;
   JointVector start_of(Robot& robot) const;
   ExecutionResult move(Robot& robot, const Trajectory& trajectory);
   // The fastest trajectory along the legs that is free of collision: corners are cut less where

@@ -126,9 +126,8 @@ class InProcessCell:
 
     def _target(self, ranked, intrinsics, camera, heights) -> Target:
         candidate = ranked.object
-        first_reason = ranked.reason
-        for grasp in candidate.grasps:
-            pose = self._core.grasp_pose(
+        pose = self._core.best_grasp_pose(
+            [
                 self._core.GraspRectangle(
                     grasp.x_px,
                     grasp.y_px,
@@ -136,24 +135,28 @@ class InProcessCell:
                     grasp.width_px,
                     grasp.quality,
                     grasp.depth_m,
-                ),
-                camera.color,
-                camera.T_base_color,
-                heights,
-                self.simulated.config,
-                self._grasp_config,
-            )
-            if pose.feasible and candidate.valid_pixels > 0:
-                point = intrinsics.deproject(
-                    candidate.centroid_u_px, candidate.centroid_v_px, candidate.centroid_depth_m
                 )
-                centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
-                self._poses[self._scene_id, candidate.object_id] = pose, centroid
-                return self._as_target(ranked, grasp, True, "")
-            first_reason = first_reason or pose.reason
-        return self._as_target(ranked, candidate.grasps[0], False, first_reason)
+                for grasp in candidate.grasps
+            ],
+            camera.color,
+            camera.T_base_color,
+            heights,
+            self.simulated.config,
+            self._grasp_config,
+        )
+        grasp = candidate.grasps[pose.candidate]
+        if not pose.feasible or candidate.valid_pixels == 0:
+            return self._as_target(ranked, grasp, False, ranked.reason or pose.reason)
+        point = intrinsics.deproject(
+            candidate.centroid_u_px, candidate.centroid_v_px, candidate.centroid_depth_m
+        )
+        centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
+        self._poses[self._scene_id, candidate.object_id] = pose, centroid
+        return self._as_target(ranked, grasp, True, "", pose.quality)
 
-    def _as_target(self, ranked, grasp: GraspRectangle, feasible: bool, reason: str) -> Target:
+    def _as_target(
+        self, ranked, grasp: GraspRectangle, feasible: bool, reason: str, quality: float = 0.0
+    ) -> Target:
         candidate = ranked.object
         return Target(
             self._scene_id,
@@ -164,6 +167,7 @@ class InProcessCell:
             grasp,
             feasible,
             reason,
+            quality,
         )
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:

@@ -210,6 +210,7 @@ class RosCell:
                     grasp_from_message(pose.grasp),
                     pose.feasible,
                     pose.reason or ranked.reason,
+                    pose.quality,
                 )
             )
         targets += [
