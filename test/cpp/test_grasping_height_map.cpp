@@ -49,6 +49,29 @@ TEST(HeightMap, BoxesStandWhereTheyAre) {
   EXPECT_EQ(heights.at(5.0, 5.0), 0.0);
 }
 
+TEST(HeightMap, SeenFromAnotherFrameTheSurfaceIsTheSame) {
+  Table table;
+  table.add({0.10, 0.06, 0.04}, Pose(Eigen::Translation3d(0.5, 0.0, 0.02)));
+  Pose T_base_view(Eigen::Translation3d(0.5, 0.0, 0.04));
+  T_base_view.rotate(Eigen::AngleAxisd(0.7, Eigen::Vector3d::UnitZ()) *
+                     Eigen::AngleAxisd(0.3, Eigen::Vector3d(1, 0.5, 0).normalized()));
+  const HeightMap view = table.heights(table.depth()).seen_from(T_base_view, 0.05);
+  // Planes z = 40 mm and z = 0 along the lines parallel to the view's z axis.
+  const auto plane = [&](double x, double y, double z) {
+    const Eigen::Vector3d p = T_base_view * Eigen::Vector3d(x, y, 0);
+    return (z - p.z()) / T_base_view.linear()(2, 2);
+  };
+  for (const double x : {-0.012, 0.0, 0.012})
+    for (const double y : {-0.012, 0.0, 0.012}) EXPECT_NEAR(view.at(x, y), plane(x, y, 0.04), 0.0015);
+  // Beside the box, on the side that leans away from it, the table; at its wall what is solid.
+  const Eigen::Vector3d off = T_base_view.inverse() * Eigen::Vector3d(0.5, 0.045, 0.0);
+  const Eigen::Vector3d far = T_base_view.inverse() * Eigen::Vector3d(0.5, -0.045, 0.0);
+  EXPECT_NEAR(std::min(view.at(off.x(), off.y()) - off.z(), view.at(far.x(), far.y()) - far.z()), 0.0, 0.002);
+  const Eigen::Vector3d wall = T_base_view.inverse() * Eigen::Vector3d(0.5, 0.0295, 0.02);
+  EXPECT_GT(view.at(wall.x(), wall.y()), wall.z() - 0.003);
+  EXPECT_TRUE(std::isinf(view.at(0.06, 0.0)));
+}
+
 TEST(HeightMap, MaxInLooksIntoTheTurnedRectangleOnly) {
   Table table;
   table.add({0.02, 0.02, 0.05}, Pose(Eigen::Translation3d(0.55, 0.05, 0.025)));

@@ -230,7 +230,86 @@ TEST(GraspPose, BadGraspsSayWhy) {
             std::string::npos);
 }
 
-TEST(BestGraspPose, TakesTheFirstFeasibleCandidate) {
+TEST(SurfaceSlope, IsThePlanesUnderNoiseAndWithARecess) {
+  const CellConfig cell = load_cell_config(IWGNET_SOURCE_DIR "/config");
+  const PinholeIntrinsics& camera = cell.camera.color;
+  for (const double rise : {-0.4, 0.0, 0.25}) {
+    cv::Mat depth(camera.height, camera.width, CV_32FC1);
+    cv::theRNG().state = 1;
+    cv::randn(depth, 0.0, 0.0005);
+    for (int v = 0; v < camera.height; ++v)
+      for (int u = 0; u < camera.width; ++u) {
+        // z = 0.05 + rise (x - 0.5) + 0.1 y along the pixel's line of sight; a groove along y.
+        const double a = (u - camera.cx) / camera.fx, b = -(v - camera.cy) / camera.fy;
+        double z = (0.6 - 0.05) / (1 + rise * a + 0.1 * b);
+        if (std::abs(a * z) < 0.004) z += 0.007;
+        depth.at<float>(v, u) += static_cast<float>(z);
+      }
+    const HeightMap heights(depth, camera, cell.camera.T_base_color, cell);
+    const Slope slope = surface_slope(heights, {0.5, 0.0}, {1, 0}, 0.05, 0.02, 0.6);
+    EXPECT_NEAR(slope.along, rise, 0.03);
+    EXPECT_NEAR(slope.across, 0.1, 0.03);
+    // Seen along another direction the same plane has the slopes exchanged.
+    const Slope turned = surface_slope(heights, {0.5, 0.0}, {0, 1}, 0.05, 0.02, 0.6);
+    EXPECT_NEAR(turned.along, 0.1, 0.05);
+    EXPECT_NEAR(turned.across, -rise, 0.05);
+  }
+}
+
+TEST(AlignedGraspPose, LeansWithARolledBar) {
+  for (const double roll : {-0.35, 0.2, 0.4}) {
+    Bench bench;
+    // A bar along x, 60 mm over the table, rolled about its axis.
+    Pose T_bar(Eigen::Translation3d(0.5, 0.0, 0.06));
+    T_bar.rotate(Eigen::AngleAxisd(roll, Eigen::Vector3d::UnitX()));
+    bench.renderer.add_instance(bench.renderer.add_box({0.12, 0.03, 0.03}), {}, T_bar);
+    const Eigen::Vector3d top = T_bar * Eigen::Vector3d(0, 0, 0.015);
+    const GraspRectangle grasp = bench.rectangle(top.x(), top.y(), top.z(), M_PI / 2, 0.03);
+    const GraspPose pose =
+        aligned_grasp_pose(grasp, bench.camera, bench.T, bench.heights(), bench.cell, bench.config);
+    ASSERT_TRUE(pose.feasible) << pose.reason;
+    EXPECT_GT(std::abs(pose.T_base_tcp.linear().col(0).dot(T_bar.linear().col(1))), std::cos(0.04));
+    EXPECT_GT(-pose.T_base_tcp.linear().col(2).dot(T_bar.linear().col(2)), std::cos(0.04));
+    EXPECT_NEAR(pose.T_base_tcp.linear().determinant(), 1.0, 1e-9);
+    // The pads' middle lies on the bar's plane of symmetry, the tips within the bar.
+    const Eigen::Vector3d tcp = T_bar.inverse() * pose.T_base_tcp.translation();
+    EXPECT_NEAR(tcp.y(), 0.0, 0.002);
+    EXPECT_GT(pose.engagement, bench.config.min_engagement - 1e-6);
+    EXPECT_NEAR(pose.quality, grasp.quality, 0.15);
+    // Straight down the same place is worth less.
+    GraspPoseConfig upright = bench.config;
+    upright.min_tilt = 1.5;
+    const GraspPose down =
+        aligned_grasp_pose(grasp, bench.camera, bench.T, bench.heights(), bench.cell, upright);
+    if (down.feasible) EXPECT_LT(down.quality, pose.quality);
+  }
+}
+
+TEST(AlignedGraspPose, GoesStraightDownOnALevelBar) {
+  Bench bench;
+  bench.bar(0.5, 0.05, 0.12, 0.03, 0.03, 0.3);
+  const GraspRectangle grasp = bench.rectangle(0.5, 0.05, 0.03, 0.3 + M_PI / 2, 0.03);
+  const HeightMap heights = bench.heights();
+  const GraspPose aligned =
+      aligned_grasp_pose(grasp, bench.camera, bench.T, heights, bench.cell, bench.config);
+  ASSERT_TRUE(aligned.feasible) << aligned.reason;
+  EXPECT_TRUE(aligned.T_base_tcp.isApprox(bench.pose(grasp).T_base_tcp, 1e-12));
+  EXPECT_NEAR(aligned.quality, grasp.quality, 0.01);
+}
+
+TEST(AlignedGraspPose, TakingANeighbourAlongCostsQuality) {
+  Bench bench;
+  bench.bar(0.5, 0.0, 0.12, 0.02, 0.03);
+  bench.bar(0.5, 0.0205, 0.12, 0.02, 0.03);  // touches it: the fingers fit around both only
+  const GraspRectangle grasp = bench.rectangle(0.5, 0.010, 0.03, M_PI / 2, 0.02);
+  const GraspPose pose =
+      aligned_grasp_pose(grasp, bench.camera, bench.T, bench.heights(), bench.cell, bench.config);
+  ASSERT_TRUE(pose.feasible) << pose.reason;
+  EXPECT_GT(pose.contact, 0.035);
+  EXPECT_LT(pose.quality, 0.5 * grasp.quality);
+}
+
+TEST(BestGraspPose, TakesTheBestFeasibleCandidate) {
   Bench bench;
   bench.bar(0.5, 0.0, 0.12, 0.03, 0.03);
   const HeightMap heights = bench.heights();
@@ -241,6 +320,9 @@ TEST(BestGraspPose, TakesTheFirstFeasibleCandidate) {
   };
   EXPECT_EQ(best({lengthways, across}).candidate, 1);
   EXPECT_TRUE(best({lengthways, across}).feasible);
+  GraspRectangle better = across;
+  better.quality = across.quality + 0.05;
+  EXPECT_EQ(best({across, lengthways, better}).candidate, 2);
   EXPECT_FALSE(best({lengthways}).feasible);
   EXPECT_FALSE(best({lengthways}).reason.empty());
   EXPECT_FALSE(best({}).feasible);

@@ -30,6 +30,24 @@ PickRequest request(double x, double y, double z, double yaw, int slot, double a
 
 Pose tcp(const JointVector& q, double gap) { return kinematics::forward(q) * kinematics::T_tool0_tcp(gap); }
 
+// What the camera measures of a surface: height(x, y) m over the table, NaN where the table is seen.
+template <typename Height>
+grasping::HeightMap heights_of(Height&& height) {
+  const PinholeIntrinsics camera = kCell.camera.color;
+  cv::Mat depth(camera.height, camera.width, CV_32FC1, cv::Scalar(0.6));
+  for (int v = 0; v < camera.height; ++v)
+    for (int u = 0; u < camera.width; ++u) {
+      double h = 0.0;
+      for (int i = 0; i < 4; ++i) {  // the point of the surface on the pixel's line of sight
+        const double z = 0.6 - h;
+        const double seen = height(0.5 + (u - camera.cx) / camera.fx * z, -(v - camera.cy) / camera.fy * z);
+        h = std::isnan(seen) ? 0.0 : seen;
+      }
+      depth.at<float>(v, u) = static_cast<float>(0.6 - h);
+    }
+  return grasping::HeightMap(depth, camera, kCell.camera.T_base_color, kCell);
+}
+
 void expect_limits(const Trajectory& trajectory, const JointLimits& limits) {
   for (const TrajectoryPoint& p : trajectory) {
     EXPECT_LE((p.qd.cwiseAbs() - limits.max_velocity).maxCoeff(), 1e-9);
@@ -93,7 +111,13 @@ TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
   PickRequest r = request(0.5, 0.05, 0.022, 0.3, 2);
   r.grasp.width = 0.055;
   r.grasp.opening = 0.075;
-  r.centroid = r.grasp.T_base_tcp * Eigen::Vector3d(0.03, 0.002, 0.0);
+  // 55 mm between the pads, 20 mm across them.
+  const Eigen::Vector2d closing = r.grasp.T_base_tcp.linear().col(0).head<2>();
+  picker.set_heights(heights_of([&](double x, double y) {
+    const Eigen::Vector2d p(x - 0.5, y - 0.05);
+    const bool on = std::abs(p.dot(closing)) < 0.0275 && std::abs(p.x() * closing.y() - p.y() * closing.x()) < 0.01;
+    return on ? 0.03 : std::nan("");
+  }));
   PickPlan plan;
   const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
   ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
@@ -101,23 +125,77 @@ TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
   const Pose T_slot = tcp(plan.carry.back().q, r.grasp.width);
   const Eigen::Vector3d axis = T_slot.linear() * (T_grasp.linear().transpose() * r.grasp.T_base_tcp.linear().col(0));
   EXPECT_NEAR(std::abs(axis.y()), 1.0, 1e-6);
-  const Eigen::Vector3d centroid = T_slot * (T_grasp.inverse() * r.centroid);
-  EXPECT_LT((centroid - kCell.tray.slots()[2]).head<2>().norm(), 1e-6);
+  // The pads hold it by its middle.
+  EXPECT_LT((T_slot.translation() - kCell.tray.slots()[2]).head<2>().norm(), 1e-6);
+}
+
+TEST(PlanPick, TheMiddleOfWhatIsSeenOfThePartLiesOverTheSlot) {
+  // A bar of 100 mm along base y, gripped 25 mm from its middle; the centroid is a neighbour's fault.
+  PickAndPlace picker(kCell, kConfig);
+  picker.set_heights(heights_of([](double x, double y) {
+    return std::abs(x - 0.5) < 0.01 && std::abs(y - 0.025) < 0.05 ? 0.03 : std::nan("");
+  }));
+  PickRequest r = request(0.5, 0.0, 0.022, 0.0, 3);
+  r.centroid = {0.54, 0.01, 0.02};
+  PickPlan plan;
+  const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+  ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+  const Pose T_grasp = tcp(plan.approach.back().q, r.grasp.width);
+  const Pose T_slot = tcp(plan.carry.back().q, r.grasp.width);
+  const Eigen::Vector3d middle = T_slot * (T_grasp.inverse() * Eigen::Vector3d(0.5, 0.025, 0.022));
+  EXPECT_LT((middle - kCell.tray.slots()[3]).head<2>().norm(), 0.003);
+}
+
+TEST(PlanPick, APartWithoutARecessMayStandOnItsEdgeAndIsLetGoHigher) {
+  // Upper side 80 mm over the table, with or without a groove of 7 mm along its middle.
+  const auto release = [&](double groove) {
+    PickAndPlace picker(kCell, kConfig);
+    picker.set_heights(heights_of([&](double x, double y) {
+      if (std::abs(x - 0.5) > 0.01 || std::abs(y) > 0.05) return std::nan("");
+      return std::abs(x - 0.5) < 0.006 ? 0.08 - groove : 0.08;
+    }));
+    const PickRequest r = request(0.5, 0.0, 0.07, 0.0, 3);
+    PickPlan plan;
+    EXPECT_EQ(picker.plan_pick(kCell.observe_joints, r, plan).reason, PickReason::kSucceeded);
+    return tcp(plan.carry.back().q, r.grasp.width).translation().z();
+  };
+  EXPECT_NEAR(release(0.0) - release(0.007), kConfig.held_height - kConfig.held_thickness, 0.002);
+}
+
+TEST(PlanPick, ALeaningGripperMovesAlongItsApproachAndStandsUprightOverTheTray) {
+  PickAndPlace picker(kCell, kConfig);
+  for (const double roll : {-0.4, 0.0, 0.4})
+    for (const double pitch : {-0.4, 0.4}) {
+      PickRequest r = request(0.5, 0.05, 0.06, 0.3, 3);
+      r.grasp.T_base_tcp.rotate(Eigen::AngleAxisd(roll, Eigen::Vector3d::UnitY()) *
+                                Eigen::AngleAxisd(pitch, Eigen::Vector3d::UnitX()));
+      PickPlan plan;
+      const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+      ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+      const Pose& T = r.grasp.T_base_tcp;
+      const Pose T_grasp = tcp(plan.approach.back().q, r.grasp.width);
+      EXPECT_LT((T_grasp.translation() - T.translation()).norm(), 1e-6);
+      EXPECT_NEAR(T_grasp.linear().col(2).dot(T.linear().col(2)), 1.0, 1e-9);
+      const auto expect_on_the_line = [&](const Trajectory& trajectory) {
+        for (const TrajectoryPoint& p : trajectory) {
+          const Eigen::Vector3d away = tcp(p.q, r.grasp.width).translation() - T.translation();
+          if (away.norm() < kConfig.approach_height / 2)
+            EXPECT_LT(away.cross(T.linear().col(2)).norm(), 0.002);
+        }
+      };
+      expect_on_the_line(plan.approach);
+      expect_on_the_line(plan.carry);
+      EXPECT_NEAR(tcp(plan.carry.back().q, r.grasp.width)(2, 2), -1.0, 1e-6);
+    }
 }
 
 TEST(PlanPick, TiltedPartsAreLetGoHigher) {
   // A bar along base y, 80 mm high at the grasp, level or rising towards +y.
-  const PinholeIntrinsics camera = kCell.camera.color;
   const auto release = [&](double slope) {
-    cv::Mat depth(camera.height, camera.width, CV_32FC1, cv::Scalar(0.6));
-    for (int v = 0; v < camera.height; ++v)
-      for (int u = 0; u < camera.width; ++u) {
-        const double z = 0.6 - 0.08, x = 0.5 + (u - camera.cx) / camera.fx * z, y = -(v - camera.cy) / camera.fy * z;
-        if (std::abs(x - 0.5) < 0.01 && std::abs(y) < 0.06)
-          depth.at<float>(v, u) = static_cast<float>(0.6 - (0.08 + slope * y));
-      }
     PickAndPlace picker(kCell, kConfig);
-    picker.set_heights(grasping::HeightMap(depth, camera, kCell.camera.T_base_color, kCell));
+    picker.set_heights(heights_of([&](double x, double y) {
+      return std::abs(x - 0.5) < 0.01 && std::abs(y) < 0.06 ? 0.08 + slope * y : std::nan("");
+    }));
     PickRequest r = request(0.5, 0.0, 0.08, 0.0, 3, 0.0);
     PickPlan plan;
     const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);

@@ -11,6 +11,7 @@ from iwgnet_grasp.supervisor import (
     Settings,
     Target,
     clear_table,
+    execution_order,
     load_settings,
 )
 from iwgnet_grasp.trials.record import run_trial, summary_line, write_json
@@ -106,6 +107,17 @@ def test_once_replan_takes_one_look_and_tries_each_object_once():
     assert cycle.looks == 1
     assert [o for o, _ in table.executed] == [0, 1, 2]
     assert not cycle.attempts[1].outcome.success
+
+
+def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():
+    grasp = GraspRectangle(10.0, 5.0, 0.1, 20.0, 0.8, 0.58)
+    qualities = {0: 0.1, 1: 0.5, 2: 0.2, 3: 0.9, 4: 0.9}
+    targets = [
+        Target(1, i, "connecting_rod", 0.9, 1.0 - 0.1 * i, grasp, i != 4, quality=q)
+        for i, q in qualities.items()
+    ]
+    assert [t.object_id for t in execution_order(targets, 0.3)] == [1, 3, 2, 0]
+    assert [t.object_id for t in execution_order(targets, 0.0)] == [0, 1, 2, 3]
 
 
 def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again():
