@@ -27,7 +27,12 @@ constexpr double kPlaneTolerance = 0.0015;  // m, 3 sigma of depth
 constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surface is something else
 constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
 constexpr int kPlaneTrials = 200;
-constexpr double kSnug = 0.004;           // m, noise of depth and of the network's width
+constexpr double kSnug = 0.006;           // m, cells of the height map, noise of the network's width
+constexpr double kSideShare = 0.4;        // of the overlap of finger and object, up from the tips: where the
+                                          // object's side is measured
+constexpr double kAmpleShare = 0.5;       // of the pad's width that touches: more is no better
+constexpr double kTouchless = 0.2;        // of the quality that is left where nothing seems to touch: the
+                                          // camera sees sides badly
 constexpr double kView = 0.09;            // m around a grasp, what the gripper's body reaches
 constexpr double kPitchScale = 3.0;       // a part that leans along the pads is held as flat: its
                                           // angle counts by so much less
@@ -248,6 +253,43 @@ Located locate(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
   return located;
 }
 
+// How well the pads will touch the measured object, in [0, 1]: the share of the pad's width, on the
+// side where it is less, over which the object's side stands as far out as it does anywhere, and how
+// far the two sides' places lie apart. A shoulder or a corner between the pads makes one side touch
+// at its edge, and the part turns. tip: m, height of the tips.
+double contact_share(const HeightMap& heights, const GraspAxes& axes, double surface, double tip,
+                     double opening) {
+  const double step = heights.resolution();
+  const double level = tip + kSideShare * (surface - tip);
+  const int rows = static_cast<int>(kinematics::kPadWidth / 2 / step);
+  const int outermost = static_cast<int>(opening / 2 / step);
+  double share = 1.0, place[2] = {0.0, 0.0};
+  for (const int side : {0, 1}) {
+    std::vector<int> reach;  // steps from the middle to the object's side, each row of the pad
+    for (int j = -rows; j <= rows; ++j) {
+      int out = outermost;
+      const auto solid = [&](int i) {
+        const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step) + axes.across * (j * step);
+        return heights.at(p.x(), p.y()) > level;
+      };
+      while (out > 0 && !solid(out)) --out;
+      reach.push_back(out);
+    }
+    const int farthest = *std::max_element(reach.begin(), reach.end());
+    int count = 0;
+    for (int j = -rows; j <= rows; ++j)
+      if (reach[j + rows] > 0 && reach[j + rows] >= farthest - 1) {
+        ++count;
+        place[side] += j * step;
+      }
+    if (count == 0) return 0.0;
+    place[side] /= count;
+    share = std::min(share, static_cast<double>(count) / reach.size());
+  }
+  const double apart = (place[0] - place[1]) / (kinematics::kPadWidth / 2);
+  return std::min(1.0, share / kAmpleShare) * std::exp(-apart * apart);
+}
+
 // Stage 3: depth and opening, in a frame whose z axis points back along the approach. heights, axes
 // and surface are seen in it.
 void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
@@ -265,6 +307,7 @@ void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
         open_tip + body.above_tips)
       return infeasible("the gripper's body would touch what lies beside the object");
 
+  pose.touch = contact_share(heights, axes, surface, descent.tip, descent.opening);
   pose.opening = descent.opening;
   pose.contact = descent.contact;
   pose.engagement = surface - descent.tip;
@@ -301,6 +344,8 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.min_tilt = positive("min_tilt");
   config.misalignment_scale = positive("misalignment_scale");
   config.spread_scale = positive("spread_scale");
+  config.shifts = file.get<std::vector<double>>("pose.shifts");
+  config.shift_scale = positive("shift_scale");
   config.finger_thickness = positive("finger_thickness");
   if (config.min_engagement > config.insertion_depth)
     file.fail("pose.min_engagement", "must not exceed insertion_depth");
@@ -391,11 +436,10 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
   return located.pose;
 }
 
-GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
-                             const Pose& T_base_camera, const HeightMap& heights,
-                             const CellConfig& cell, const GraspPoseConfig& config) {
-  const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
-  if (!located.pose.reason.empty()) return located.pose;
+namespace {
+
+// The located grasp with an approach that follows the object's surface.
+GraspPose leaning(const Located& located, const HeightMap& heights, const GraspPoseConfig& config) {
   const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
                                     std::min(located.pose.width, config.max_opening), config.max_tilt);
   const double roll = std::atan(slope.along), pitch = std::atan(slope.across);
@@ -438,13 +482,37 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
       lower(pose, T_base_view, view, axes, surface, table, config);
     }
     if (pose.feasible) {
-      const double beside = std::max(0.0, pose.contact - pose.width - kSnug) / config.spread_scale;
-      pose.quality *= std::exp(-beside * beside);
+      // What lies below the upper edge of a leaning object is hidden, not necessarily taken.
+      const double hidden = 2 * pose.engagement * std::abs(std::tan(lean.roll));
+      const double beside = std::max(0.0, pose.contact - pose.width - hidden - kSnug) / config.spread_scale;
+      pose.quality *= std::exp(-beside * beside) * (kTouchless + (1 - kTouchless) * pose.touch);
       return pose;
     }
     if (first.reason.empty()) first = pose;
   }
   return first;
+}
+
+}  // namespace
+
+GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+                             const Pose& T_base_camera, const HeightMap& heights,
+                             const CellConfig& cell, const GraspPoseConfig& config) {
+  const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
+  if (!located.pose.reason.empty()) return located.pose;
+  GraspPose best = leaning(located, heights, config);
+  for (const double shift : config.shifts) {
+    Located beside = located;
+    beside.axes.center += shift * located.axes.across;
+    beside.surface = surface_height(heights, beside.axes, std::min(beside.pose.width, config.max_opening));
+    if (std::abs(beside.surface - located.surface) > kPlaneBelow + std::abs(shift) * std::tan(config.max_tilt))
+      continue;  // off the object
+    GraspPose pose = leaning(beside, heights, config);
+    const double off = shift / config.shift_scale;
+    pose.quality *= std::exp(-off * off);
+    if (pose.feasible && (!best.feasible || pose.quality > best.quality)) best = std::move(pose);
+  }
+  return best;
 }
 
 GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,

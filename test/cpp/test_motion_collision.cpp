@@ -121,7 +121,7 @@ TEST(CollisionWorld, PartsAreMetByTheirHeights) {
   // Onto the part itself the fingers go unchecked, the palm does not.
   Pose down(Eigen::Translation3d(0.5, 0.0, 0.02));
   down.rotate(Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX()));
-  world.set_columns({Column(down)});
+  world.set_columns({motion::Column(down)});
   EXPECT_FALSE(world.collides(over));
   EXPECT_FALSE(world.collides(tool_down(0.502, 0.0, 0.06)));
   EXPECT_TRUE(world.collides(tool_down(0.505, 0.0, 0.06)));

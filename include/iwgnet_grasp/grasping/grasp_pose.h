@@ -25,6 +25,7 @@ struct GraspPose {
   double opening = 0.0;                // m, gap to approach with
   double contact = 0.0;                // m, least gap at which the measured surface lets both fingers in
   double quality = 0.0;
+  double touch = 0.0;                  // [0, 1], how much of the pads will touch the measured object
   double tip_height = 0.0;             // m, finger tips over base_link's z = 0 once closed
   double engagement = 0.0;             // m, overlap of finger and object along the approach
   int candidate = 0;                   // which of best_grasp_pose()'s candidates this is
@@ -49,6 +50,8 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double min_tilt;           // rad, a surface that slopes less is taken for level
   double misalignment_scale; // rad, between pads and object, at which quality has fallen to 1/e
   double spread_scale;       // m that `contact` exceeds the width, likewise
+  std::vector<double> shifts;  // m across the closing direction, other places that are tried
+  double shift_scale;        // m of such a shift, likewise
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
   std::vector<Eigen::Vector2d> finger_outline;
@@ -81,9 +84,10 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
 
 // The same with an approach that follows the object: where its upper side slopes, the gripper leans
 // with it as far as what lies around it permits, so that both pads meet the object flat. A part that
-// is gripped by its edges turns between the pads as soon as it leaves the table. quality is the
-// network's, less what the angle left between pads and object and a neighbour that the fingers would
-// have to take along cost: each exp(-(amount / scale)^2).
+// is gripped by its edges turns between the pads as soon as it leaves the table. Places beside the
+// grasp along the pads are tried as well. quality is the network's, less what is measured: the angle
+// left between pads and object, a neighbour that the fingers would have to take along, the distance
+// from the network's place, each exp(-(amount / scale)^2), and pads that touch by their edge only.
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
                              const CellConfig& cell, const GraspPoseConfig& config);
