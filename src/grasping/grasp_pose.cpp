@@ -27,6 +27,7 @@ constexpr double kPlaneTolerance = 0.0015;  // m, 3 sigma of depth
 constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surface is something else
 constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
 constexpr int kPlaneTrials = 200;
+constexpr double kGoesOn = 0.004;         // m from where a straight upper side would be
 constexpr double kSnug = 0.006;           // m, cells of the height map, noise of the network's width
 constexpr double kSideShare = 0.4;        // of the overlap of finger and object, up from the tips: where the
                                           // object's side is measured
@@ -439,9 +440,8 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
 namespace {
 
 // The located grasp with an approach that follows the object's surface.
-GraspPose leaning(const Located& located, const HeightMap& heights, const GraspPoseConfig& config) {
-  const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
-                                    std::min(located.pose.width, config.max_opening), config.max_tilt);
+GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& heights,
+                  const GraspPoseConfig& config) {
   const double roll = std::atan(slope.along), pitch = std::atan(slope.across);
 
   struct Lean {
@@ -500,14 +500,17 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
                              const CellConfig& cell, const GraspPoseConfig& config) {
   const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
   if (!located.pose.reason.empty()) return located.pose;
-  GraspPose best = leaning(located, heights, config);
+  const double width = std::min(located.pose.width, config.max_opening);
+  const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
+                                    width, config.max_tilt);
+  GraspPose best = leaning(located, slope, heights, config);
   for (const double shift : config.shifts) {
     Located beside = located;
     beside.axes.center += shift * located.axes.across;
-    beside.surface = surface_height(heights, beside.axes, std::min(beside.pose.width, config.max_opening));
-    if (std::abs(beside.surface - located.surface) > kPlaneBelow + std::abs(shift) * std::tan(config.max_tilt))
-      continue;  // off the object
-    GraspPose pose = leaning(beside, heights, config);
+    beside.surface = surface_height(heights, beside.axes, width);
+    // A straight part goes on as it slopes; what does not is round there, or another.
+    if (std::abs(beside.surface - located.surface - slope.across * shift) > kGoesOn) continue;
+    GraspPose pose = leaning(beside, slope, heights, config);
     const double off = shift / config.shift_scale;
     pose.quality *= std::exp(-off * off);
     if (pose.feasible && (!best.feasible || pose.quality > best.quality)) best = std::move(pose);

@@ -20,7 +20,7 @@ using Clock = std::chrono::steady_clock;
 constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is where it was sent
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
-constexpr double kFarthestCentroid = 0.03;  // m from the grasp point: farther out nothing is gripped
+constexpr double kFarthestCentroid = 0.04;  // m from the grasp point: farther out nothing is gripped
 constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
 constexpr double kMiddle = 0.004;        // m along the closing direction: farther out is beside the middle
 constexpr double kMiddleLength = 0.008;  // m across it
@@ -183,7 +183,7 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
       grasping::surface_slope(heights, {0, 0}, {1, 0}, surface, width, std::atan(kSteepest));
 
   // The pads stand at the part's sides: along the closing direction it is as long as the gap and
-  // centred. Across it, it goes on as long as its upper side does.
+  // centred. Across it, it goes on at least as long as its upper side does.
   const auto profile = [&](double y) {
     double highest = -1.0;
     for (double x = -width / 2; x <= width / 2; x += heights.resolution())
@@ -198,14 +198,10 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   }
   const double length = ends[0] + ends[1];
   held.lengthwise = length < width;
-  // Where a neighbour goes on as the part does, its end is not seen: the centroid of all that is
-  // seen of it, as far as that can be, has to do.
   const double center_y = (T_base_view.inverse() * centroid).y();
-  held.offset = length <= config_.held_length ? (ends[1] - ends[0]) / 2
-                                              : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
+  held.offset = held.lengthwise ? 0.0 : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
   const double rise = held.lengthwise ? slope.along : slope.across;
-  const double offset = held.lengthwise ? 0.0 : held.offset;
-  const double low_end = std::abs(rise) * std::max(0.0, config_.held_reach + (rise > 0 ? -offset : offset));
+  const double low_end = std::abs(rise) * std::max(0.0, config_.held_reach + (rise > 0 ? -held.offset : held.offset));
 
   // A rod that lies flat shows the recess of its shank or a bore midway between the pads, lower than
   // what is beside it on both sides; one that stands on its edge does not, and reaches lower.
@@ -276,7 +272,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   const HeldPart seen = held_part(grasp.T_base_tcp, grasp.width, request.centroid);
   const bool lengthwise = seen.lengthwise;
   // In the TCP frame, whose y axis is the view's turned round.
-  const Eigen::Vector3d offset(0.0, lengthwise ? 0.0 : -seen.offset, 0.0);
+  const Eigen::Vector3d offset(0.0, -seen.offset, 0.0);
   const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
   const Eigen::Vector3d slot = slots[request.tray_slot];
   const double inwards = cell_.tray.center.x() < slot.x() ? -1.0 : 1.0;

@@ -129,14 +129,14 @@ TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
   EXPECT_LT((T_slot.translation() - kCell.tray.slots()[2]).head<2>().norm(), 1e-6);
 }
 
-TEST(PlanPick, TheMiddleOfWhatIsSeenOfThePartLiesOverTheSlot) {
-  // A bar of 100 mm along base y, gripped 25 mm from its middle; the centroid is a neighbour's fault.
+TEST(PlanPick, ThePadsStandAtThePartsSidesWhateverTheCentroidSays) {
+  // A bar along base y, gripped 25 mm from its middle; a neighbour draws the centroid aside.
   PickAndPlace picker(kCell, kConfig);
   picker.set_heights(heights_of([](double x, double y) {
     return std::abs(x - 0.5) < 0.01 && std::abs(y - 0.025) < 0.05 ? 0.03 : std::nan("");
   }));
   PickRequest r = request(0.5, 0.0, 0.022, 0.0, 3);
-  r.centroid = {0.54, 0.01, 0.02};
+  r.centroid = {0.52, 0.025, 0.02};
   PickPlan plan;
   const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
   ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;

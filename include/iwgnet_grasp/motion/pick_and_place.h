@@ -109,8 +109,8 @@ class PickAndPlace {
   // What the heights tell of the part that is grasped at the pose. It is laid into the tray by it.
   struct HeldPart {
     bool lengthwise = false;  // its long axis lies along the closing direction
-    double offset = 0.0;      // m from the grasp to its middle, across the closing direction, in the
-                              // direction of approach x closing
+    double offset = 0.0;      // m from the grasp to its centroid, across the closing direction, in
+                              // the direction of closing x approach
     double hang = 0.0;        // m below the finger tips, at most: by its height, flat or on its edge,
                               // and by the slope of its upper side against the gripper; no lower than
                               // the table
