@@ -85,11 +85,12 @@ void bind_grasping(py::module_& m) {
       "best_grasp_pose",
       [](const std::vector<GraspRectangle>& grasps, const PinholeIntrinsics& camera,
          const Eigen::Matrix4d& T_base_camera, const HeightMap& heights, const CellConfig& cell,
-         const GraspPoseConfig& config) {
+         const GraspPoseConfig& config, const std::optional<Eigen::Vector3d>& centroid) {
         return grasping::best_grasp_pose(grasps, camera, to_pose(T_base_camera, "T_base_camera"),
-                                         heights, cell, config);
+                                         heights, cell, config, centroid);
       },
       "grasps"_a, "camera"_a, "T_base_camera"_a, "heights"_a, "cell"_a, "config"_a,
+      "centroid"_a = py::none(),
       "The best feasible pose of the candidates, leaning with the object; else the first with its "
       "reason.");
 }

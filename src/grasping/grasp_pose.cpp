@@ -341,12 +341,14 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.min_engagement = positive("min_engagement");
   config.floor_clearance = positive("floor_clearance");
   config.border = file.get<double>("pose.border");
-  config.max_tilt = positive("max_tilt");
+  config.max_roll = positive("max_roll");
+  config.max_pitch = positive("max_pitch");
   config.min_tilt = positive("min_tilt");
   config.misalignment_scale = positive("misalignment_scale");
   config.spread_scale = positive("spread_scale");
   config.shifts = file.get<std::vector<double>>("pose.shifts");
   config.shift_scale = positive("shift_scale");
+  config.lever_scale = positive("lever_scale");
   config.finger_thickness = positive("finger_thickness");
   if (config.min_engagement > config.insertion_depth)
     file.fail("pose.min_engagement", "must not exceed insertion_depth");
@@ -376,9 +378,10 @@ double width_in_metres(double width_px, double depth_m, double fx_px) {
 
 // RANSAC (Fischler and Bolles 1981), then least squares.
 Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
-                    const Eigen::Vector2d& along, double surface, double width, double max_tilt) {
+                    const Eigen::Vector2d& along, double surface, double width, double max_along,
+                    double max_across) {
   const Eigen::Vector2d across(-along.y(), along.x());
-  const double step = heights.resolution(), steepest = std::tan(max_tilt);
+  const double step = heights.resolution();
   const int n = std::max(2, static_cast<int>(width / 2 / step));
   const int m = static_cast<int>(kPatchHalf / step);
   std::vector<Eigen::Vector3d> points;  // along, across, over the surface
@@ -404,7 +407,8 @@ Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
     if (std::abs(normal.z()) < 1e-5) continue;  // m^2: a sliver
     Eigen::Vector3d plane(-normal.x() / normal.z(), -normal.y() / normal.z(), 0.0);
     plane.z() = a.z() - plane.x() * a.x() - plane.y() * a.y();
-    if (plane.head<2>().norm() > steepest || plane.z() < -kPlaneBelow) continue;
+    if (std::abs(plane.x()) > max_along || std::abs(plane.y()) > max_across || plane.z() < -kPlaneBelow)
+      continue;
     const int inliers = static_cast<int>(std::count_if(
         points.begin(), points.end(), [&](const Eigen::Vector3d& p) { return lies_in(plane, p); }));
     if (inliers > most) {
@@ -424,7 +428,7 @@ Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
     }
     best = normal.ldlt().solve(right);
   }
-  if (!best.allFinite() || best.head<2>().norm() > steepest) return {};
+  if (!best.allFinite() || std::abs(best.x()) > max_along || std::abs(best.y()) > max_across) return {};
   return {best.x(), best.y()};
 }
 
@@ -497,20 +501,28 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
 
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
-                             const CellConfig& cell, const GraspPoseConfig& config) {
+                             const CellConfig& cell, const GraspPoseConfig& config,
+                             const std::optional<Eigen::Vector3d>& centroid) {
   const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
   if (!located.pose.reason.empty()) return located.pose;
+  const auto with_lever = [&](GraspPose pose) {
+    if (!pose.feasible || !centroid) return pose;
+    const Eigen::Vector3d away = *centroid - pose.T_base_tcp.translation();
+    const double lever = away.dot(pose.T_base_tcp.linear().col(1)) / config.lever_scale;
+    pose.quality *= std::exp(-lever * lever);
+    return pose;
+  };
   const double width = std::min(located.pose.width, config.max_opening);
   const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
-                                    width, config.max_tilt);
-  GraspPose best = leaning(located, slope, heights, config);
+                                    width, std::tan(config.max_roll), std::tan(config.max_pitch));
+  GraspPose best = with_lever(leaning(located, slope, heights, config));
   for (const double shift : config.shifts) {
     Located beside = located;
     beside.axes.center += shift * located.axes.across;
     beside.surface = surface_height(heights, beside.axes, width);
     // A straight part goes on as it slopes; what does not is round there, or another.
     if (std::abs(beside.surface - located.surface - slope.across * shift) > kGoesOn) continue;
-    GraspPose pose = leaning(beside, slope, heights, config);
+    GraspPose pose = with_lever(leaning(beside, slope, heights, config));
     const double off = shift / config.shift_scale;
     pose.quality *= std::exp(-off * off);
     if (pose.feasible && (!best.feasible || pose.quality > best.quality)) best = std::move(pose);
@@ -521,11 +533,12 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
 GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
                           const PinholeIntrinsics& camera, const Pose& T_base_camera,
                           const HeightMap& heights, const CellConfig& cell,
-                          const GraspPoseConfig& config) {
+                          const GraspPoseConfig& config,
+                          const std::optional<Eigen::Vector3d>& centroid) {
   GraspPose best;
   best.reason = "no grasp was found for the object";
   for (std::size_t i = 0; i < candidates.size(); ++i) {
-    GraspPose pose = aligned_grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config);
+    GraspPose pose = aligned_grasp_pose(candidates[i], camera, T_base_camera, heights, cell, config, centroid);
     pose.candidate = static_cast<int>(i);
     if (i == 0 || (pose.feasible && (!best.feasible || pose.quality > best.quality)))
       best = std::move(pose);

@@ -158,6 +158,7 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.release_margin = positive("release_margin");
   config.release_height = positive("release_height");
   config.held_height = positive("held_part.height");
+  config.max_hang = positive("held_part.max_hang");
   return config;
 }
 
@@ -180,7 +181,7 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   const double surface = heights.max_in({0, 0}, 0.0, {0.006, 0.006});
 
   const grasping::Slope slope =
-      grasping::surface_slope(heights, {0, 0}, {1, 0}, surface, width, std::atan(kSteepest));
+      grasping::surface_slope(heights, {0, 0}, {1, 0}, surface, width, kSteepest, kSteepest);
 
   // The pads stand at the part's sides: along the closing direction it is as long as the gap and
   // centred. Across it, it goes on at least as long as its upper side does.
@@ -220,7 +221,7 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   const Eigen::Vector3d tips = T_base_view * Eigen::Vector3d(0, 0, tip);
   const double tilt = std::abs(T_base_view.linear()(2, held.lengthwise ? 0 : 1));
   const double table = (tips.z() + config_.held_reach * tilt) / T_base_view.linear()(2, 2);
-  held.hang = std::clamp(thickness + low_end - (surface - tip), 0.0, std::clamp(table, 0.0, config_.held_height));
+  held.hang = std::clamp(thickness + low_end - (surface - tip), 0.0, std::clamp(table, 0.0, config_.max_hang));
   return held;
 }
 

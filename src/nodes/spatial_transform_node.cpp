@@ -130,8 +130,12 @@ class SpatialTransform {
       if (object.grasps.empty()) continue;
       std::vector<grasping::GraspRectangle> candidates;
       for (const GraspRectangle& grasp : object.grasps) candidates.push_back(from_message(grasp));
-      const grasping::GraspPose pose =
-          grasping::best_grasp_pose(candidates, camera, T_base_camera, heights_, cell_, config_);
+      std::optional<Eigen::Vector3d> centroid;
+      if (object.valid_pixels > 0)
+        centroid = T_base_camera * sensing::deproject(camera, object.centroid_u_px,
+                                                      object.centroid_v_px, object.centroid_depth_m);
+      const grasping::GraspPose pose = grasping::best_grasp_pose(
+          candidates, camera, T_base_camera, heights_, cell_, config_, centroid);
 
       GraspPose message = to_message(pose);
       if (object.valid_pixels == 0) {
@@ -140,9 +144,7 @@ class SpatialTransform {
       }
       message.object_id = object.object_id;
       message.grasp = object.grasps.at(pose.candidate);
-      message.centroid = to_message(Eigen::Vector3d(
-          T_base_camera * sensing::deproject(camera, object.centroid_u_px, object.centroid_v_px,
-                                             object.centroid_depth_m)));
+      if (centroid) message.centroid = to_message(*centroid);
       GripperWidth width;
       width.object_id = object.object_id;
       width.opening = pose.opening;

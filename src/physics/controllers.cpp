@@ -142,9 +142,12 @@ GripperStatus GripperController::update(World& world, double time) {
   if (!status_.active) return status_;
   const GripperState state = world.gripper();
   const bool still = std::abs(state.speed) < kStillSpeed;
-  if (!still) still_since_ = -1.0;
-  else if (still_since_ < 0) still_since_ = time;
-  const bool settled = still && time - still_since_ >= kStallTime;
+  // By the way of the gap, not its speed, which trembles on an elastic grip.
+  if (still_since_ < 0 || std::abs(state.gap - still_gap_) > kStillSpeed * kStallTime) {
+    still_since_ = time;
+    still_gap_ = state.gap;
+  }
+  const bool settled = time - still_since_ >= kStallTime;
   if (std::abs(state.gap - gap_) < kGapTolerance && still) {
     status_ = {false, true, false};
   } else if (settled && time - start_time_ >= kStartTime + kStallTime) {

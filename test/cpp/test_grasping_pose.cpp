@@ -246,18 +246,18 @@ TEST(SurfaceSlope, IsThePlanesUnderNoiseAndWithARecess) {
         depth.at<float>(v, u) += static_cast<float>(z);
       }
     const HeightMap heights(depth, camera, cell.camera.T_base_color, cell);
-    const Slope slope = surface_slope(heights, {0.5, 0.0}, {1, 0}, 0.05, 0.02, 0.6);
+    const Slope slope = surface_slope(heights, {0.5, 0.0}, {1, 0}, 0.05, 0.02, 0.7, 0.7);
     EXPECT_NEAR(slope.along, rise, 0.03);
     EXPECT_NEAR(slope.across, 0.1, 0.03);
     // Seen along another direction the same plane has the slopes exchanged.
-    const Slope turned = surface_slope(heights, {0.5, 0.0}, {0, 1}, 0.05, 0.02, 0.6);
+    const Slope turned = surface_slope(heights, {0.5, 0.0}, {0, 1}, 0.05, 0.02, 0.7, 0.7);
     EXPECT_NEAR(turned.along, 0.1, 0.05);
     EXPECT_NEAR(turned.across, -rise, 0.05);
   }
 }
 
 TEST(AlignedGraspPose, LeansWithARolledBar) {
-  for (const double roll : {-0.35, 0.2, 0.4}) {
+  for (const double roll : {-0.6, 0.2, 0.4}) {
     Bench bench;
     // A bar along x, 60 mm over the table, rolled about its axis.
     Pose T_bar(Eigen::Translation3d(0.5, 0.0, 0.06));
@@ -273,7 +273,7 @@ TEST(AlignedGraspPose, LeansWithARolledBar) {
     EXPECT_NEAR(pose.T_base_tcp.linear().determinant(), 1.0, 1e-9);
     // The pads' middle lies on the bar's plane of symmetry, the tips within the bar.
     const Eigen::Vector3d tcp = T_bar.inverse() * pose.T_base_tcp.translation();
-    EXPECT_NEAR(tcp.y(), 0.0, 0.002);
+    EXPECT_NEAR(tcp.y(), 0.0, 0.003);
     EXPECT_GT(pose.engagement, bench.config.min_engagement - 1e-6);
     EXPECT_NEAR(pose.quality, grasp.quality, 0.1);
     // Straight down the same place is worth less.
@@ -281,7 +281,9 @@ TEST(AlignedGraspPose, LeansWithARolledBar) {
     upright.min_tilt = 1.5;
     const GraspPose down =
         aligned_grasp_pose(grasp, bench.camera, bench.T, bench.heights(), bench.cell, upright);
-    if (down.feasible) EXPECT_LT(down.quality, pose.quality);
+    if (down.feasible) {
+      EXPECT_LT(down.quality, pose.quality);
+    }
   }
 }
 
@@ -295,6 +297,21 @@ TEST(AlignedGraspPose, GoesStraightDownOnALevelBar) {
   ASSERT_TRUE(aligned.feasible) << aligned.reason;
   EXPECT_TRUE(aligned.T_base_tcp.isApprox(bench.pose(grasp).T_base_tcp, 1e-12));
   EXPECT_NEAR(aligned.quality, grasp.quality, 0.01);
+}
+
+TEST(AlignedGraspPose, MovesAlongThePadsTowardsTheCentroid) {
+  Bench bench;
+  bench.bar(0.5, 0.0, 0.14, 0.03, 0.03);
+  const HeightMap heights = bench.heights();
+  const GraspRectangle grasp = bench.rectangle(0.54, 0.0, 0.03, M_PI / 2, 0.03);
+  const auto at = [&](const std::optional<Eigen::Vector3d>& centroid) {
+    return aligned_grasp_pose(grasp, bench.camera, bench.T, heights, bench.cell, bench.config, centroid);
+  };
+  const GraspPose free = at(std::nullopt), drawn = at(Eigen::Vector3d(0.5, 0.0, 0.03));
+  ASSERT_TRUE(free.feasible && drawn.feasible);
+  EXPECT_NEAR(free.T_base_tcp.translation().x(), 0.54, 1e-3);
+  EXPECT_LT(drawn.T_base_tcp.translation().x(), 0.535);
+  EXPECT_LT(drawn.quality, free.quality);
 }
 
 TEST(AlignedGraspPose, TakingANeighbourAlongCostsQuality) {

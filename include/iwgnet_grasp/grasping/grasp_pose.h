@@ -1,6 +1,7 @@
 // From a grasp in the image to a grasp pose of the gripper (three stages of section 2.2, Eq. 5).
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -46,12 +47,14 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double min_engagement;     // m, least overlap of finger and object
   double floor_clearance;    // m, finger tips above whatever lies under them
   double border;             // m, how far outside the workspace a grasp may lie
-  double max_tilt;           // rad, of the approach against the vertical
+  double max_roll, max_pitch;  // rad, of the approach against the vertical, in the closing direction and
+                               // across it
   double min_tilt;           // rad, a surface that slopes less is taken for level
   double misalignment_scale; // rad, between pads and object, at which quality has fallen to 1/e
   double spread_scale;       // m that `contact` exceeds the width, likewise
   std::vector<double> shifts;  // m across the closing direction, other places that are tried
   double shift_scale;        // m of such a shift, likewise
+  double lever_scale;        // m from the centroid, likewise
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
   std::vector<Eigen::Vector2d> finger_outline;
@@ -66,9 +69,10 @@ struct Slope {
 
 // Slope of an object's upper side: of the plane that holds most of what is seen between the jaws,
 // `width` apart along the unit vector `along`, and is not far below `surface` (m). Level when there
-// is none, or none up to max_tilt (rad).
+// is none, or none with slopes up to max_along and max_across.
 Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
-                    const Eigen::Vector2d& along, double surface, double width, double max_tilt);
+                    const Eigen::Vector2d& along, double surface, double width, double max_along,
+                    double max_across);
 
 // Eq. 5: pixels to metres at depth z.
 double width_in_metres(double width_px, double depth_m, double fx_px);
@@ -87,15 +91,18 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
 // is gripped by its edges turns between the pads as soon as it leaves the table. Places beside the
 // grasp along the pads are tried as well. quality is the network's, less what is measured: the angle
 // left between pads and object, a neighbour that the fingers would have to take along, the distance
-// from the network's place, each exp(-(amount / scale)^2), and pads that touch by their edge only.
+// from the network's place and, along the pads, from the object's centroid (base_link) where that is
+// known, each exp(-(amount / scale)^2), and pads that touch by their edge only.
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
-                             const CellConfig& cell, const GraspPoseConfig& config);
+                             const CellConfig& cell, const GraspPoseConfig& config,
+                             const std::optional<Eigen::Vector3d>& centroid = {});
 
 // The feasible aligned pose of the highest quality, else the first with its reason.
 GraspPose best_grasp_pose(const std::vector<GraspRectangle>& candidates,
                           const PinholeIntrinsics& camera, const Pose& T_base_camera,
                           const HeightMap& heights, const CellConfig& cell,
-                          const GraspPoseConfig& config);
+                          const GraspPoseConfig& config,
+                          const std::optional<Eigen::Vector3d>& centroid = {});
 
 }  // namespace iwgnet_grasp::grasping

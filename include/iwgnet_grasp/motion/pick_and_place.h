@@ -56,6 +56,7 @@ struct PickPlaceConfig {  // config/motion.yaml
   double held_length, held_radius;  // m, capsule that stands for a held part
   double held_reach;              // m from a part's centroid to its far end, at most
   double held_thickness, held_height;  // m, at most, lying flat and standing on its edge
+  double max_hang;                // m, most room that is left for it under the finger tips
   double release_margin;          // m, fingers open by this much beyond the object
   double release_height;          // m, part's lowest point above the tray floor when letting go
 };

@@ -69,7 +69,7 @@ class GripperController {
 
  private:
   double gap_ = 0.085, force_ = 40.0;
-  double start_time_ = 0.0, still_since_ = -1.0;
+  double start_time_ = 0.0, still_since_ = -1.0, still_gap_ = 0.0;
   GripperStatus status_;
 };
 

@@ -126,6 +126,12 @@ class InProcessCell:
 
     def _target(self, ranked, intrinsics, camera, heights) -> Target:
         candidate = ranked.object
+        centroid = None
+        if candidate.valid_pixels > 0:
+            point = intrinsics.deproject(
+                candidate.centroid_u_px, candidate.centroid_v_px, candidate.centroid_depth_m
+            )
+            centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
         pose = self._core.best_grasp_pose(
             [
                 self._core.GraspRectangle(
@@ -143,14 +149,11 @@ class InProcessCell:
             heights,
             self.simulated.config,
             self._grasp_config,
+            centroid,
         )
         grasp = candidate.grasps[pose.candidate]
-        if not pose.feasible or candidate.valid_pixels == 0:
+        if not pose.feasible or centroid is None:
             return self._as_target(ranked, grasp, False, ranked.reason or pose.reason)
-        point = intrinsics.deproject(
-            candidate.centroid_u_px, candidate.centroid_v_px, candidate.centroid_depth_m
-        )
-        centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
         self._poses[self._scene_id, candidate.object_id] = pose, centroid
         return self._as_target(ranked, grasp, True, "", pose.quality)
 
