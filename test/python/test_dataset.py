@@ -35,7 +35,7 @@ from iwgnet_grasp.data.lift_check import plan_check, require_stored, summary
 from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
-SCENES, SEED = 4, 5  # two piles of three looks, the second cut short
+SCENES, SEED = 4, 8  # two piles of three looks, the second cut short
 LIFTS = 4
 
 
