@@ -71,6 +71,14 @@ def train(
     patience: Annotated[
         int, typer.Option(min=0, help="Stop after N epochs without a better top-1; 0: never.")
     ] = 0,
+    hard_share: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Least share of crops of parts that are hard to grasp; 0: as they come.",
+        ),
+    ] = 0.5,
     seed: Annotated[int, typer.Option(help="Of weights, order, augmentation and split.")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = False,
     accelerator: Annotated[str, typer.Option(help="auto, cpu or gpu.")] = "auto",
@@ -98,6 +106,7 @@ def train(
         learning_rate=learning_rate,
         split=split.value,
         patience=patience,
+        hard_share=hard_share,
         seed=seed,
     )
     typer.echo(f"seed {seed}, network {network}, data {', '.join(map(str, data))}")

@@ -21,6 +21,7 @@ from iwgnet_grasp.training.card import describe_set
 from iwgnet_grasp.training.grasp_training import (
     GraspTrainingSettings,
     TrainingResources,
+    draw,
     train_grasp_network,
 )
 from iwgnet_grasp.training.losses import grasp_loss
@@ -233,3 +234,20 @@ def test_bad_requests_are_one_line(tmp_path):
         train(data, tmp_path, resume=True)
     with pytest.raises(DataError, match="no such folder"):
         train(tmp_path / "absent", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("hard_count", "share"), [(10, 0.5), (70, 0.5), (0, 0.5), (100, 0.5), (3, 1.0)]
+)
+def test_an_epoch_has_its_share_of_hard_samples(hard_count, share):
+    hard = np.zeros(100, bool)
+    hard[:hard_count] = True
+    order = draw(hard, share, np.random.default_rng(1))
+    assert len(order) == 100
+    drawn = np.count_nonzero(hard[order])
+    natural = hard_count in (0, 100)
+    assert drawn == (hard_count if natural else max(hard_count, share * 100))
+    # Each kind is gone through evenly.
+    for kind in (order[hard[order]], order[~hard[order]]):
+        counts = np.unique(kind, return_counts=True)[1]
+        assert len(counts) == 0 or counts.max() - counts.min() <= 1

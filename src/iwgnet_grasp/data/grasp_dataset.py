@@ -115,6 +115,7 @@ class GraspDataset(Dataset):
 
     An item: heights [1, S, S] and labels [5, S, S] (q, cos, sin, width, mask), float32. With an
     augmentation the crop is a function of (seed, index) alone; without one it is the view's centre.
+    `order`: (n,) the view of each item; by default item i is view i.
     """
 
     def __init__(
@@ -123,19 +124,22 @@ class GraspDataset(Dataset):
         input_px: int,
         augmentation: Augmentation | None = None,
         seed: tuple[int, ...] = (0,),
+        order: np.ndarray | None = None,
     ) -> None:
         self.views = views
         self.input_px = input_px
         self.augmentation = augmentation
         self.seed = seed
+        self.order = np.arange(len(views)) if order is None else order
 
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self.order)
 
     def crop(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Heights [S, S] float32 and the rectangles [n, 6] in that crop."""
-        height = self.views.heights[index].astype(np.float32)
-        rectangles = self.views.rectangles[index]
+        view = self.order[index]
+        height = self.views.heights[view].astype(np.float32)
+        rectangles = self.views.rectangles[view]
         if self.augmentation is None:
             return centre_crop(height, rectangles, self.input_px)
         rng = np.random.default_rng((*self.seed, index))
