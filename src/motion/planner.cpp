@@ -34,6 +34,14 @@ double since(Clock::time_point start) {
   return std::chrono::duration<double>(Clock::now() - start).count();
 }
 
+// The result with its end written into it; an empty message is success.
+const PlanResult& ended(PlanResult& result, const std::string& message, Clock::time_point start) {
+  result.success = message.empty();
+  result.message = message;
+  result.seconds = since(start);
+  return result;
+}
+
 JointVector joints_of(const ob::State* state) {
   return Eigen::Map<const JointVector>(state->as<ob::RealVectorStateSpace::StateType>()->values);
 }
@@ -177,12 +185,7 @@ PlanResult plan(const CollisionWorld& world, const JointVector& from, const Join
                 const PlannerConfig& config) {
   const auto start = Clock::now();
   PlanResult result;
-  const auto finish = [&](const std::string& message) {
-    result.success = message.empty();
-    result.message = message;
-    result.seconds = since(start);
-    return result;
-  };
+  const auto finish = [&](const std::string& message) { return ended(result, message, start); };
   if (!from.allFinite() || !to.allFinite()) return finish("a joint angle is not finite");
   for (const auto& [q, name] : {std::pair{from, "start"}, std::pair{to, "goal"}}) {
     if (world.collides(q))
@@ -219,12 +222,7 @@ PlanResult plan_straight(const CollisionWorld& world, const JointVector& from, c
                          bool check, double step_m, double tolerance_m) {
   const auto start = Clock::now();
   PlanResult result;
-  const auto finish = [&](const std::string& message) {
-    result.success = message.empty();
-    result.message = message;
-    result.seconds = since(start);
-    return result;
-  };
+  const auto finish = [&](const std::string& message) { return ended(result, message, start); };
   if (!from.allFinite() || !T_base_tool0.matrix().allFinite())
     return finish("the straight motion's start or goal is not finite");
   const Pose T_start = kinematics::forward(from);

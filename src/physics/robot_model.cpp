@@ -13,7 +13,6 @@
 #include <map>
 
 namespace iwgnet_grasp::physics {
-namespace {
 
 Pose pose_of(const urdf::Pose& p) {
   Pose T = Pose::Identity();
@@ -24,7 +23,7 @@ Pose pose_of(const urdf::Pose& p) {
   return T;
 }
 
-std::string resolve(const std::string& uri, const std::string& package_dir) {
+std::string mesh_path(const std::string& uri, const std::string& package_dir) {
   const std::string scheme = "package://";
   if (uri.rfind(scheme, 0) != 0) return uri;
   const auto slash = uri.find('/', scheme.size());
@@ -32,6 +31,8 @@ std::string resolve(const std::string& uri, const std::string& package_dir) {
     throw Error("URDF: mesh '" + uri + "' names no file; use package://NAME/PATH");
   return package_dir + uri.substr(slash);
 }
+
+namespace {
 
 std::unique_ptr<btConvexInternalShape> collision_shape(const urdf::Geometry& geometry,
                                                        const std::string& package_dir,
@@ -55,7 +56,7 @@ std::unique_ptr<btConvexInternalShape> collision_shape(const urdf::Geometry& geo
     default: {
       const auto& mesh = static_cast<const urdf::Mesh&>(geometry);
       Pose scale = Pose::Identity();
-      TriangleMesh triangles = load_stl(resolve(mesh.filename, package_dir));
+      TriangleMesh triangles = load_stl(mesh_path(mesh.filename, package_dir));
       for (auto& v : triangles.vertices) {
         v.x() *= mesh.scale.x;
         v.y() *= mesh.scale.y;

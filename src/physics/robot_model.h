@@ -10,7 +10,15 @@
 #include "physics_config.h"
 #include "pieces.h"
 
+namespace urdf {
+class Pose;
+}
+
 namespace iwgnet_grasp::physics {
+
+Pose pose_of(const urdf::Pose& p);  // of an <origin>; its quaternion need not be of unit length
+// File of a mesh's URI; package://NAME/ stands for package_dir. Throws Error.
+std::string mesh_path(const std::string& uri, const std::string& package_dir);
 
 struct RobotLink {
   std::string name;

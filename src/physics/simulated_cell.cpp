@@ -15,6 +15,7 @@
 #include "iwgnet_grasp/kinematics/ur5.h"
 #include "iwgnet_grasp/physics/calibration_rig.h"
 #include "iwgnet_grasp/sensing/pinhole.h"
+#include "robot_model.h"
 
 namespace iwgnet_grasp::physics {
 namespace {
@@ -40,15 +41,6 @@ std::uint64_t mix(std::uint64_t seed, std::uint64_t stream) {
   z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
   z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
   return z ^ (z >> 31);
-}
-
-Pose pose_of(const urdf::Pose& p) {
-  Pose T = Pose::Identity();
-  T.linear() = Eigen::Quaterniond(p.rotation.w, p.rotation.x, p.rotation.y, p.rotation.z)
-                   .normalized()
-                   .toRotationMatrix();
-  T.translation() << p.position.x, p.position.y, p.position.z;
-  return T;
 }
 
 bool is_stl(const std::string& path) {
@@ -156,10 +148,7 @@ struct SimulatedCell::Impl {
 
   // A mesh of the package as the renderer's handle; loaded once a file and scale.
   int mesh_of(const urdf::Mesh& mesh) {
-    const std::string prefix = "package://iwgnet_grasp/";
-    const std::string path = mesh.filename.rfind(prefix, 0) == 0
-                                 ? package_dir + "/" + mesh.filename.substr(prefix.size())
-                                 : mesh.filename;
+    const std::string path = mesh_path(mesh.filename, package_dir);
     const auto found = meshes.find(path);
     if (found != meshes.end()) return found->second;
     TriangleMesh triangles = load_stl(path);
