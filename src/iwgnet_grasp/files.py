@@ -2,7 +2,13 @@
 
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+Config = TypeVar("Config")
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -23,3 +29,26 @@ def write_whole(path: Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def read_config(
+    path: str | Path,
+    what: str,
+    build: Callable[[Any], Config],
+    refusal: type[Exception],
+) -> Config:
+    """What `build` makes of a YAML file's content; `what` is what messages call the file.
+
+    Raises `refusal` with the file's name for one that is missing or malformed, for a key
+    that `build` misses (KeyError) and for a value that it refuses (TypeError, ValueError).
+    """
+    path = Path(path)
+    try:
+        return build(yaml.safe_load(path.read_text()))
+    except OSError as error:
+        raise refusal(f"{path}: cannot be read ({error.strerror})") from error
+    except KeyError as error:
+        raise refusal(f"{path}: key {error} is missing") from error
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        line = " ".join(str(error).split())
+        raise refusal(f"{path}: not a valid {what} ({line})") from error

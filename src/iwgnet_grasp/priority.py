@@ -9,9 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from iwgnet_grasp.perception.config import read_config
+from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.pipeline import PACKAGE, same_grasp
-from iwgnet_grasp.perception.types import CameraIntrinsics, GraspRectangle, ObjectGrasps
+from iwgnet_grasp.perception.types import (
+    CameraIntrinsics,
+    GraspRectangle,
+    ObjectGrasps,
+    PerceptionError,
+)
 
 DEFAULT_CONFIG = PACKAGE / "config" / "priority.yaml"
 
@@ -30,7 +35,7 @@ class PriorityConfig:
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> PriorityConfig:
         """Raises PerceptionError for a file that is missing, malformed or lacks a key."""
-        return read_config(path, "priority config", PriorityConfig._of)
+        return read_config(path, "priority config", PriorityConfig._of, PerceptionError)
 
     @staticmethod
     def _of(text: dict) -> PriorityConfig:

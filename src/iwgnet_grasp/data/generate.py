@@ -34,14 +34,6 @@ import numpy as np
 import tifffile
 import typer
 import yaml
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
@@ -52,6 +44,7 @@ from iwgnet_grasp.files import disk_error, write_whole
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
 from iwgnet_grasp.perception.types import Box, Window
+from iwgnet_grasp.progress import progress_bar
 
 PACKAGE = Path(__file__).resolve().parents[3]
 CONFIG = PACKAGE / "config" / "dataset.yaml"
@@ -618,18 +611,6 @@ def _in_piles(
         done, running = wait(running, return_when=FIRST_COMPLETED)
         for future in done:
             yield pool.result(future)
-
-
-def progress_bar(quiet: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        disable=quiet,
-    )
 
 
 def generate(

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from iwgnet_grasp.data.letterbox import Region, checked_region
-from iwgnet_grasp.perception.config import read_config
+from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.merged_depth import (
     centroid,
     crop_window,
@@ -71,7 +71,7 @@ class PerceptionConfig:
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> PerceptionConfig:
         """Raises PerceptionError for a file that is missing, malformed or lacks a key."""
-        return read_config(path, "perception config", PerceptionConfig._of)
+        return read_config(path, "perception config", PerceptionConfig._of, PerceptionError)
 
     @staticmethod
     def _of(text: dict) -> PerceptionConfig:

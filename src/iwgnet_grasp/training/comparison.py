@@ -8,18 +8,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.networks.weights import WeightsError, load_weights, weights_path
 from iwgnet_grasp.perception.types import PerceptionError
+from iwgnet_grasp.progress import progress_bar
 from iwgnet_grasp.training.evaluation import (
     NetworkRun,
     Prediction,
@@ -76,7 +70,7 @@ def compare_networks(
         except LiftsUnavailable as error:
             log.warning("lifts: %s; left out", error)
             lifts = 0
-    with _bar(progress) as bar:
+    with progress_bar(quiet=not progress) as bar:
         objects = sum(len(s.views) for s in sets)
         runs = []
         stems = Counter(weights_path(name).stem for name in usable)
@@ -265,15 +259,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return round(value, 4) if math.isfinite(value) else None
     return value
-
-
-def _bar(shown: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        disable=not shown,
-    )

@@ -17,7 +17,6 @@ import lightning
 import numpy as np
 import torch
 import typer
-import yaml
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -32,6 +31,7 @@ from iwgnet_grasp.data.detection import (
     load_detection_set,
 )
 from iwgnet_grasp.data.letterbox import WHOLE, Region, checked_region
+from iwgnet_grasp.files import read_config
 from iwgnet_grasp.networks.weights import load_state, read_card, save_weights
 from iwgnet_grasp.networks.yolov5s import ANCHORS, YOLOv5s, decode, non_maximum_suppression
 from iwgnet_grasp.training.card import describe_set, earlier_stage
@@ -86,48 +86,44 @@ class DetectorTrainingConfig:
     @staticmethod
     def load(path: str | Path = DEFAULT_CONFIG) -> DetectorTrainingConfig:
         """Raises DetectorTrainingError for a file that is missing, malformed or lacks a key."""
-        path = Path(path)
-        try:
-            text = yaml.safe_load(path.read_text())
-            phases = tuple(
-                Phase(
-                    epochs=int(p["epochs"]),
-                    images=int(p["images"]),
-                    size=_size(p["size"]),
-                    zoom=float(p["zoom"]),
-                    batch=int(p["batch"]),
-                )
-                for p in text["phases"]
+        return read_config(
+            path, "detector training config", DetectorTrainingConfig._of, DetectorTrainingError
+        )
+
+    @staticmethod
+    def _of(text: Any) -> DetectorTrainingConfig:
+        phases = tuple(
+            Phase(
+                epochs=int(p["epochs"]),
+                images=int(p["images"]),
+                size=_size(p["size"]),
+                zoom=float(p["zoom"]),
+                batch=int(p["batch"]),
             )
-            loss = text["loss"]
-            return DetectorTrainingConfig(
-                phases=phases,
-                input=_size(text["input"]),
-                region=checked_region(text["region"]),
-                anchors=_anchors(text["anchors"]),
-                held_out=float(text["held_out"]),
-                seed=int(text["seed"]),
-                learning_rate=float(text["learning_rate"]),
-                final_learning_rate=float(text["final_learning_rate"]),
-                warmup_steps=int(text["warmup_steps"]),
-                weight_decay=float(text["weight_decay"]),
-                ema_decay=float(text["ema_decay"]),
-                batch_norm_images=int(text["batch_norm_images"]),
-                loss=LossWeights(
-                    box=float(loss["box"]),
-                    objectness=float(loss["objectness"]),
-                    classes=float(loss["class"]),
-                    anchor_ratio=float(loss["anchor_ratio"]),
-                    balance=tuple(float(b) for b in loss["balance"]),
-                ),
-            )
-        except OSError as error:
-            raise DetectorTrainingError(f"{path}: cannot be read ({error.strerror})") from error
-        except KeyError as error:
-            raise DetectorTrainingError(f"{path}: key {error} is missing") from error
-        except (yaml.YAMLError, TypeError, ValueError) as error:
-            line = " ".join(str(error).split())
-            raise DetectorTrainingError(f"{path}: not a training config ({line})") from error
+            for p in text["phases"]
+        )
+        loss = text["loss"]
+        return DetectorTrainingConfig(
+            phases=phases,
+            input=_size(text["input"]),
+            region=checked_region(text["region"]),
+            anchors=_anchors(text["anchors"]),
+            held_out=float(text["held_out"]),
+            seed=int(text["seed"]),
+            learning_rate=float(text["learning_rate"]),
+            final_learning_rate=float(text["final_learning_rate"]),
+            warmup_steps=int(text["warmup_steps"]),
+            weight_decay=float(text["weight_decay"]),
+            ema_decay=float(text["ema_decay"]),
+            batch_norm_images=int(text["batch_norm_images"]),
+            loss=LossWeights(
+                box=float(loss["box"]),
+                objectness=float(loss["objectness"]),
+                classes=float(loss["class"]),
+                anchor_ratio=float(loss["anchor_ratio"]),
+                balance=tuple(float(b) for b in loss["balance"]),
+            ),
+        )
 
     @property
     def epochs(self) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 from iwgnet_grasp.perception.types import CameraIntrinsics, GraspRectangle, Look, PerceptionError
 from iwgnet_grasp.priority import PriorityConfig, Ranking, rank
 from iwgnet_grasp.supervisor import CellError, Outcome, Target, load_settings
+from iwgnet_grasp.trials.lift import core_rectangle
 from iwgnet_grasp.trials.record import Trial, judged_by, run_trial, summary_line
 
 PACKAGE = Path(__file__).resolve().parents[3]
@@ -133,17 +134,7 @@ class InProcessCell:
             )
             centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
         pose = self._core.best_grasp_pose(
-            [
-                self._core.GraspRectangle(
-                    grasp.x_px,
-                    grasp.y_px,
-                    grasp.theta_rad,
-                    grasp.width_px,
-                    grasp.quality,
-                    grasp.depth_m,
-                )
-                for grasp in candidate.grasps
-            ],
+            [core_rectangle(self._core, grasp) for grasp in candidate.grasps],
             camera.color,
             camera.T_base_color,
             heights,

@@ -50,6 +50,13 @@ class Lift:
         return self.outcome not in NOT_EXECUTED
 
 
+def core_rectangle(core: Any, grasp: GraspRectangle) -> Any:
+    """The grasp as a _core.GraspRectangle."""
+    return core.GraspRectangle(
+        grasp.x_px, grasp.y_px, grasp.theta_rad, grasp.width_px, grasp.quality, grasp.depth_m
+    )
+
+
 class _OverTheTray(Exception):
     """Ends a pick whose part hangs over its slot: the lift is known."""
 
@@ -81,17 +88,9 @@ class Lifter:
 
     def pose(self, grasp: GraspRectangle, heights: Any) -> Any:
         """_core.GraspPose of a rectangle in the colour image, as the robot would compute it."""
-        rectangle = self._core.GraspRectangle(
-            grasp.x_px,
-            grasp.y_px,
-            grasp.theta_rad,
-            grasp.width_px,
-            grasp.quality,
-            grasp.depth_m,
-        )
         camera = self.cell.camera
         return self._core.grasp_pose(
-            rectangle,
+            core_rectangle(self._core, grasp),
             camera.color,
             camera.T_base_color,
             heights,
