@@ -398,7 +398,11 @@ def test_metrics_of_each_arrangement_stand_beside_those_of_all():
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
-    [("phases: []", "missing"), ("phases: 3", "not a valid detector training config"), ("[", "not a valid detector training")],
+    [
+        ("phases: []", "missing"),
+        ("phases: 3", "not a valid detector training config"),
+        ("[", "not a valid detector training"),
+    ],
 )
 def test_malformed_training_config_is_one_line(tmp_path, text, complaint):
     path = tmp_path / "training.yaml"
