@@ -63,7 +63,10 @@ class Session:
             _refuse_second_graph(uri)
         else:
             options = ["--port", str(_port_for_master(uri))]
-        self._log_dir.mkdir(parents=True, exist_ok=True)
+        try:
+            self._log_dir.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise CellError(f"{self._log_dir}: the logs need this folder, but it is a file") from None
         environment = {
             **os.environ,
             _TAG: self._tag,
