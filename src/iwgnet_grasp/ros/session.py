@@ -66,7 +66,7 @@ class Session:
         try:
             self._log_dir.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
-            raise CellError(f"{self._log_dir}: the logs need this folder, but it is a file") from None
+            raise CellError(f"{self._log_dir}: is a file; the logs need a folder there") from None
         environment = {
             **os.environ,
             _TAG: self._tag,
