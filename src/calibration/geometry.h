@@ -3,6 +3,7 @@
 
 #include <Eigen/Dense>
 #include <algorithm>
+#include <utility>
 #include <vector>
 
 #include "iwgnet_grasp/core/types.h"
@@ -36,6 +37,25 @@ inline double median(std::vector<double> values) {
   const auto middle = values.begin() + values.size() / 2;
   std::nth_element(values.begin(), middle, values.end());
   return *middle;
+}
+
+// Largest move (m, rad) of the camera's pose when one of the items is left out of `solve`, which
+// makes a result with success and T_base_camera of the rest. A rest that cannot be solved counts for
+// nothing.
+template <class Item, class Solve>
+std::pair<double, double> leave_one_out(const std::vector<Item>& items, const Pose& T_base_camera,
+                                        const Solve& solve) {
+  std::pair<double, double> spread{0.0, 0.0};
+  for (std::size_t out = 0; out < items.size(); ++out) {
+    std::vector<Item> rest = items;
+    rest.erase(rest.begin() + static_cast<long>(out));
+    const auto other = solve(rest);
+    if (!other.success) continue;
+    const Pose change = T_base_camera.inverse() * other.T_base_camera;
+    spread.first = std::max(spread.first, change.translation().norm());
+    spread.second = std::max(spread.second, rotation_vector(change.linear()).norm());
+  }
+  return spread;
 }
 
 }  // namespace iwgnet_grasp::calibration

@@ -250,17 +250,9 @@ std::pair<double, double> axxb_rms(const std::vector<PosePair>& pairs, const Pos
 std::pair<double, double> leave_one_out_spread(const std::vector<PosePair>& pairs,
                                                const HandEyeResult& result, const PoseNoise& noise,
                                                const Limits& limits) {
-  std::pair<double, double> spread{0.0, 0.0};
-  for (std::size_t out = 0; out < pairs.size(); ++out) {
-    std::vector<PosePair> rest = pairs;
-    rest.erase(rest.begin() + static_cast<long>(out));
-    const HandEyeResult other = refine(rest, result.T_base_camera, noise, limits);
-    if (!other.success) continue;
-    const Pose change = result.T_base_camera.inverse() * other.T_base_camera;
-    spread.first = std::max(spread.first, change.translation().norm());
-    spread.second = std::max(spread.second, rotation_vector(change.linear()).norm());
-  }
-  return spread;
+  return leave_one_out(pairs, result.T_base_camera, [&](const std::vector<PosePair>& rest) {
+    return refine(rest, result.T_base_camera, noise, limits);
+  });
 }
 
 }  // namespace iwgnet_grasp::calibration

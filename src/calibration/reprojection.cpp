@@ -148,17 +148,9 @@ ReprojectionResult refine_reprojection(const std::vector<TargetView>& views,
 std::pair<double, double> leave_one_out_spread(const std::vector<TargetView>& views,
                                                const PinholeIntrinsics& camera,
                                                const ReprojectionResult& result) {
-  std::pair<double, double> spread{0.0, 0.0};
-  for (std::size_t out = 0; out < views.size(); ++out) {
-    std::vector<TargetView> rest = views;
-    rest.erase(rest.begin() + static_cast<long>(out));
-    const auto other = refine_reprojection(rest, camera, result.T_base_camera, result.T_tool_target);
-    if (!other.success) continue;
-    const Pose change = result.T_base_camera.inverse() * other.T_base_camera;
-    spread.first = std::max(spread.first, change.translation().norm());
-    spread.second = std::max(spread.second, rotation_vector(change.linear()).norm());
-  }
-  return spread;
+  return leave_one_out(views, result.T_base_camera, [&](const std::vector<TargetView>& rest) {
+    return refine_reprojection(rest, camera, result.T_base_camera, result.T_tool_target);
+  });
 }
 
 }  // namespace iwgnet_grasp::calibration

@@ -237,7 +237,7 @@ class SceneMaker:
         only free by less than the noise is none."""
         camera, config = self.cell.camera, self.cell.config
         view = camera.color, camera.T_base_color
-        heights = self.core.HeightMap(stereo, *view, config, border=0.11)
+        heights = self.core.HeightMap(stereo, *view, config)
         return [
             label
             for label in labels
