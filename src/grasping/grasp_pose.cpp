@@ -310,6 +310,7 @@ void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
 
   pose.touch = contact_share(heights, axes, surface, descent.tip, descent.opening);
   pose.opening = descent.opening;
+  pose.width = std::min(pose.width, pose.opening);  // the network's may be wider than what is measured
   pose.contact = descent.contact;
   pose.engagement = surface - descent.tip;
   const double tool_height = descent.tip + finger_tip_height(descent.closed);

@@ -33,8 +33,8 @@ cv::Rect pixels_of(const Eigen::Vector2d& low, const Eigen::Vector2d& high,
   return seen & image;
 }
 
-// Fills unknown cells ring by ring with the highest of their known neighbours.
-void fill_unknown(cv::Mat& grid) {
+// Fills unknown cells ring by ring with the lowest or the highest of their known neighbours.
+void fill_unknown(cv::Mat& grid, bool lowest) {
   std::vector<cv::Point> open;
   for (int r = 0; r < grid.rows; ++r)
     for (int c = 0; c < grid.cols; ++c)
@@ -49,14 +49,17 @@ void fill_unknown(cv::Mat& grid) {
     filled.clear();
     rest.clear();
     for (const cv::Point& cell : open) {
-      float highest = kUnknown;
+      float extreme = kUnknown;
       for (int r = std::max(cell.y - 1, 0); r <= std::min(cell.y + 1, grid.rows - 1); ++r)
         for (int c = std::max(cell.x - 1, 0); c <= std::min(cell.x + 1, grid.cols - 1); ++c)
-          highest = std::max(highest, grid.at<float>(r, c));
-      if (highest == kUnknown)
+          if (const float height = grid.at<float>(r, c); height != kUnknown)
+            extreme = extreme == kUnknown ? height
+                      : lowest            ? std::min(extreme, height)
+                                          : std::max(extreme, height);
+      if (extreme == kUnknown)
         rest.push_back(cell);
       else
-        filled.emplace_back(cell, highest);
+        filled.emplace_back(cell, extreme);
     }
     for (const auto& [cell, height] : filled) grid.at<float>(cell) = height;
     open.swap(rest);
@@ -103,7 +106,7 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
       cell_height = std::max(cell_height, (ray.z() + az * u) * z + tz);
     }
   }
-  fill_unknown(grid_);
+  fill_unknown(grid_, true);
 }
 
 HeightMap HeightMap::seen_from(const Pose& T_base_view, double half) const {
@@ -143,7 +146,7 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, double half) const {
         height = std::max(height, static_cast<float>(p.z()));
       }
     }
-  fill_unknown(view.grid_);
+  fill_unknown(view.grid_, false);
   return view;
 }
 

@@ -22,9 +22,6 @@ constexpr double kAtRest = 0.005;        // rad: near enough to the observing po
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
 constexpr double kFarthestCentroid = 0.04;  // m from the grasp point: farther out nothing is gripped
 constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
-constexpr double kMiddle = 0.004;        // m along the closing direction: farther out is beside the middle
-constexpr double kMiddleLength = 0.008;  // m across it
-constexpr double kRecess = 0.0035;       // m, a recess is deeper
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
@@ -59,6 +56,22 @@ Pose half_turn(const Pose& T_base_tcp) {
   Pose T = T_base_tcp;
   T.linear().leftCols<2>() *= -1.0;
   return T;
+}
+
+double height_of(const JointVector& q) { return kinematics::forward(q).translation().z(); }
+
+// A straight path upwards, cut `distance` over its start; both parts have the point of the cut.
+std::pair<JointPath, JointPath> split(const JointPath& up, double distance) {
+  const double level = height_of(up.front()) + distance;
+  auto next = up.begin() + 1;
+  while (next + 1 != up.end() && height_of(*next) < level) ++next;
+  const JointVector &a = *(next - 1), &b = *next;
+  const double share = (level - height_of(a)) / (height_of(b) - height_of(a));
+  const JointVector cut = a + std::clamp(share, 0.0, 1.0) * (b - a);
+  JointPath lower(up.begin(), next), above(next, up.end());
+  lower.push_back(cut);
+  above.insert(above.begin(), cut);
+  return {lower, above};
 }
 
 std::string millimetres(const Eigen::Vector3d& p) {
@@ -154,11 +167,13 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.held_length = positive("held_part.length");
   config.held_radius = positive("held_part.radius");
   config.held_reach = positive("held_part.reach");
-  config.held_thickness = positive("held_part.thickness");
   config.release_margin = positive("release_margin");
   config.release_height = positive("release_height");
-  config.held_height = positive("held_part.height");
   config.max_hang = positive("held_part.max_hang");
+  config.max_fall = positive("max_fall");
+  config.lower_speed = positive("lower_speed");
+  config.contact_tolerance = file.vector("contact_tolerance", kJoints);
+  if (!(config.contact_tolerance.minCoeff() > 0)) file.fail("contact_tolerance", "must be positive");
   return config;
 }
 
@@ -201,27 +216,12 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   held.lengthwise = length < width;
   const double center_y = (T_base_view.inverse() * centroid).y();
   held.offset = held.lengthwise ? 0.0 : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
-  const double rise = held.lengthwise ? slope.along : slope.across;
-  const double low_end = std::abs(rise) * std::max(0.0, config_.held_reach + (rise > 0 ? -held.offset : held.offset));
-
-  // A rod that lies flat shows the recess of its shank or a bore midway between the pads, lower than
-  // what is beside it on both sides; one that stands on its edge does not, and reaches lower.
-  std::vector<double> dips;
-  for (double y = -kMiddleLength; y <= kMiddleLength; y += heights.resolution()) {
-    double sides[2] = {-1.0, -1.0};
-    for (double x = kMiddle; x <= width / 2 + kMiddle; x += heights.resolution())
-      for (const int side : {0, 1}) sides[side] = std::max(sides[side], heights.at(side ? x : -x, y));
-    dips.push_back(std::min(sides[0], sides[1]) - heights.at(0.0, y));
-  }
-  std::nth_element(dips.begin(), dips.begin() + dips.size() / 2, dips.end());
-  const bool flat = dips[dips.size() / 2] > kRecess;
-  const double thickness = flat ? config_.held_thickness : config_.held_height;
-
-  // No deeper than the table below the low end.
+  // How far it reaches down cannot be seen from above, only that it ends at the table. Turned upright
+  // over the tray it hangs lower by what the gripper leans now.
   const Eigen::Vector3d tips = T_base_view * Eigen::Vector3d(0, 0, tip);
   const double tilt = std::abs(T_base_view.linear()(2, held.lengthwise ? 0 : 1));
   const double table = (tips.z() + config_.held_reach * tilt) / T_base_view.linear()(2, 2);
-  held.hang = std::clamp(thickness + low_end - (surface - tip), 0.0, std::clamp(table, 0.0, config_.max_hang));
+  held.hang = std::clamp(table, 0.0, config_.max_hang);
   return held;
 }
 
@@ -274,7 +274,11 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   const bool lengthwise = seen.lengthwise;
   // In the TCP frame, whose y axis is the view's turned round.
   const Eigen::Vector3d offset(0.0, -seen.offset, 0.0);
-  const double rise = std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
+  // A part that reaches less far below the tips falls the rest; on the way down from where it may
+  // touch, the tool is slow.
+  const double last = std::min(seen.hang, config_.max_fall);
+  const double slow = seen.hang - last;
+  const double rise = slow + std::max(config_.approach_height, cell_.tray.wall_height + kWallClearance);
   const Eigen::Vector3d slot = slots[request.tray_slot];
   const double inwards = cell_.tray.center.x() < slot.x() ? -1.0 : 1.0;
   const auto slot_poses = [&](int grasp_turn, double shift) {
@@ -287,7 +291,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
       pose.translation() = slot - pose.linear() * centroid;
       pose.translation().x() += inwards * shift;
       pose.translation().z() =
-          cell_.tray.floor_height + config_.release_height + seen.hang + kinematics::kPadHeight / 2;
+          cell_.tray.floor_height + config_.release_height + last + kinematics::kPadHeight / 2;
     }
     return poses;
   };
@@ -372,9 +376,15 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
       continue;
     }
     const double unlimited = std::numeric_limits<double>::infinity();
+    const auto [lower, above] = split(s.up, slow);
     plan.carry = timed({carried(g.up, config_.lift_speed), carried(to_slot.path, unlimited),
-                        carried(reversed(s.up), config_.approach_speed)}, why);
+                        carried(reversed(above), config_.approach_speed)}, why);
     if (plan.carry.empty()) continue;
+    plan.lower.clear();
+    if (slow > 0) {
+      plan.lower = timed({carried(reversed(lower), config_.lower_speed)}, why);
+      if (plan.lower.empty()) continue;
+    }
 
     world_.set_attached(std::nullopt);
     world_.set_gripper_gap(released);
@@ -384,7 +394,9 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
       why = "way back: " + home.message;
       continue;
     }
-    plan.retreat = timed({leg(s.up, config_.limits), leg(home.path, config_.limits)}, why);
+    plan.up = s.up;
+    plan.home = home.path;
+    plan.retreat = timed({leg(plan.up, config_.limits), leg(plan.home, config_.limits)}, why);
     if (plan.retreat.empty()) continue;
     return finish(PickReason::kSucceeded, "");
   }
@@ -400,11 +412,24 @@ JointVector PickAndPlace::start_of(Robot& robot) const {
   return q;
 }
 
-ExecutionResult PickAndPlace::move(Robot& robot, const Trajectory& trajectory) {
-  const ExecutionResult result = robot.execute(trajectory);
+ExecutionResult PickAndPlace::move(Robot& robot, const Trajectory& trajectory, bool until_contact) {
+  const ExecutionResult result =
+      until_contact ? robot.execute_until_contact(trajectory, config_.contact_tolerance)
+                    : robot.execute(trajectory);
   commanded_.reset();
-  if (result.success) commanded_ = trajectory.back().q;
+  if (result.success && !result.contact) commanded_ = trajectory.back().q;
   return result;
+}
+
+Trajectory PickAndPlace::retreat_from(const JointVector& q, const PickPlan& plan) const {
+  PathLeg up, home;
+  up.path = {q};
+  std::copy_if(plan.up.begin(), plan.up.end(), std::back_inserter(up.path),
+               [&](const JointVector& p) { return height_of(p) > height_of(q); });
+  home.path = plan.home;
+  up.limits = home.limits = config_.limits;
+  std::string why;
+  return timed({up, home}, why);
 }
 
 PickResult PickAndPlace::observe(Robot& robot) {
@@ -512,6 +537,11 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
     return fail(PickReason::kExecutionFailed, "cancelled before the lift");
   }
   moved = move(robot, plan.carry);
+  bool contact = false;
+  if (moved.success && !plan.lower.empty()) {
+    moved = move(robot, plan.lower, true);
+    contact = moved.contact;
+  }
   if (!moved.success) {
     put_back(robot, plan, opening);
     return fail(PickReason::kExecutionFailed, "transfer: " + moved.message);
@@ -530,7 +560,8 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
   if (!released.success)
     return fail(PickReason::kExecutionFailed, "the gripper did not let go: " + released.message);
   begin("return");
-  moved = move(robot, plan.retreat);
+  const Trajectory early = contact ? retreat_from(start_of(robot), plan) : Trajectory();
+  moved = move(robot, early.empty() ? plan.retreat : early);
   if (!moved.success) return fail(PickReason::kExecutionFailed, "the part is in the tray; return: " + moved.message);
   return result;
 }

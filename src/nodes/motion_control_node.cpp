@@ -63,16 +63,16 @@ class RosRobot : public motion::Robot {
   }
 
   motion::ExecutionResult execute(const motion::Trajectory& trajectory) override {
-    control_msgs::FollowJointTrajectoryGoal goal;
-    goal.trajectory = to_message(trajectory);
-    goal.trajectory.header.frame_id = Topics::BASE_FRAME;
-    const double duration = trajectory.empty() ? 0.0 : trajectory.back().time;
-    const auto outcome = call_action(arm_, Topics::ARM_ACTION, goal, ros::Duration(duration + 10.0),
-                                     cancelled_);
-    if (!outcome.finished) return {false, outcome.message};
-    if (outcome.succeeded) return {true, ""};
-    return {false, "the arm's controller gave up: " + outcome.result.error_string +
-                       (outcome.result.error_string.empty() ? outcome.message : "")};
+    motion::ExecutionResult result = follow(trajectory, {});
+    result.contact = false;
+    return result;
+  }
+
+  motion::ExecutionResult execute_until_contact(const motion::Trajectory& trajectory,
+                                                const JointVector& path_tolerance) override {
+    motion::ExecutionResult result = follow(trajectory, path_tolerance);
+    if (result.contact) result.success = true;
+    return result;
   }
 
   motion::GripResult grip(double gap_m, double /*force_n: topic 4 carries it*/) override {
@@ -102,6 +102,29 @@ class RosRobot : public motion::Robot {
   }
 
  private:
+  motion::ExecutionResult follow(const motion::Trajectory& trajectory,
+                                 const std::optional<JointVector>& path_tolerance) {
+    control_msgs::FollowJointTrajectoryGoal goal;
+    goal.trajectory = to_message(trajectory);
+    goal.trajectory.header.frame_id = Topics::BASE_FRAME;
+    for (int j = 0; path_tolerance && j < kJoints; ++j) {
+      control_msgs::JointTolerance tolerance;
+      tolerance.name = goal.trajectory.joint_names[j];
+      tolerance.position = (*path_tolerance)[j];
+      goal.path_tolerance.push_back(tolerance);
+    }
+    const double duration = trajectory.empty() ? 0.0 : trajectory.back().time;
+    const auto outcome = call_action(arm_, Topics::ARM_ACTION, goal, ros::Duration(duration + 10.0),
+                                     cancelled_);
+    if (!outcome.finished) return {false, outcome.message};
+    if (outcome.succeeded) return {true, ""};
+    using Result = control_msgs::FollowJointTrajectoryResult;
+    return {false,
+            "the arm's controller gave up: " + outcome.result.error_string +
+                (outcome.result.error_string.empty() ? outcome.message : ""),
+            outcome.result.error_code == Result::PATH_TOLERANCE_VIOLATED};
+  }
+
   GripGoal goal_for(double gap_m) {
     GripGoal goal = grip_goal_;
     goal.gap = gap_m;

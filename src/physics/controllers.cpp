@@ -80,9 +80,11 @@ std::string TrajectoryController::start(const motion::Trajectory& trajectory,
     motion::TrajectoryPoint now = rest_at(arm.q);
     now.qd = arm.qd;
     accepted.insert(accepted.begin(), now);
-  } else if (const int j = worst_joint(accepted.front().q - arm.q, tolerances.path); j >= 0) {
-    return "trajectory starts too far from the arm: " +
-           joint_error(j, accepted.front().q[j] - arm.q[j], tolerances.path[j]);
+  } else {
+    // Not the goal's tolerances, which may be those of a contact.
+    const JointVector away = accepted.front().q - arm.q, limit = default_tolerances().path;
+    if (const int j = worst_joint(away, limit); j >= 0)
+      return "trajectory starts too far from the arm: " + joint_error(j, away[j], limit[j]);
   }
   trajectory_ = std::move(accepted);
   tolerances_ = tolerances;

@@ -585,17 +585,34 @@ Verdict SimulatedCell::verdict() const { return impl_->judge.verdict(impl_->worl
 JointVector SimulatedRobot::joints() { return cell_.arm().q; }
 
 motion::ExecutionResult SimulatedRobot::execute(const motion::Trajectory& trajectory) {
-  const TrajectoryTolerances tolerances = default_tolerances();
+  motion::ExecutionResult result = follow(trajectory, default_tolerances());
+  result.contact = false;
+  return result;
+}
+
+motion::ExecutionResult SimulatedRobot::execute_until_contact(const motion::Trajectory& trajectory,
+                                                              const JointVector& path_tolerance) {
+  TrajectoryTolerances tolerances = default_tolerances();
+  tolerances.path = path_tolerance;
+  motion::ExecutionResult result = follow(trajectory, tolerances);
+  if (result.contact) result.success = true;
+  return result;
+}
+
+motion::ExecutionResult SimulatedRobot::follow(const motion::Trajectory& trajectory,
+                                               const TrajectoryTolerances& tolerances) {
   const std::string refusal = cell_.start_trajectory(trajectory, tolerances);
   if (!refusal.empty()) return {false, "trajectory refused: " + refusal};
   const double give_up =
       cell_.time() + trajectory.back().time + tolerances.goal_time + kExecuteMargin;
   while (cell_.arm_controller().status() == TrajectoryStatus::kActive && cell_.time() < give_up)
     cell_.step();
-  if (cell_.arm_controller().status() != TrajectoryStatus::kSucceeded) {
+  const TrajectoryStatus status = cell_.arm_controller().status();
+  if (status != TrajectoryStatus::kSucceeded) {
     const std::string why = cell_.arm_controller().message();
     cell_.arm_controller().cancel(cell_.arm());
-    return {false, why.empty() ? "the arm did not reach the trajectory's end in time" : why};
+    return {false, why.empty() ? "the arm did not reach the trajectory's end in time" : why,
+            status == TrajectoryStatus::kPathViolated};
   }
   const double settled_by = cell_.time() + kSettleTime;
   while (cell_.arm().qd.cwiseAbs().maxCoeff() > kRestSpeed && cell_.time() < settled_by)

@@ -160,3 +160,34 @@ TEST_F(PickCycle, ComesHomeFromContact) {
   EXPECT_EQ(result.reason, PickReason::kSucceeded) << result.message;
   expect_observing();
 }
+
+TEST_F(PickCycle, LowersAPartUntilItTouches) {
+  SimulatedRobot robot(*cell);
+  const PickPlaceConfig config = load_pick_place_config(kSource + "/config");
+  PickPlan plan;
+  ASSERT_EQ(picker->plan_pick(cell->config().observe_joints, grasp(1, 0), plan).reason, PickReason::kSucceeded);
+  ASSERT_TRUE(robot.execute(plan.approach).success);
+  ASSERT_TRUE(robot.grip(0.0, config.grip_force).success);
+  const double lying = cell->world().part(1).T_base_part.translation().z();
+
+  const CollisionWorld world(cell->config());
+  const auto straight = [&](double up, double speed) {
+    const JointVector q = robot.joints();
+    Pose T = kinematics::forward(q);
+    T.translation().z() += up;
+    PathLeg leg;
+    leg.path = plan_straight(world, q, T, false).path;
+    leg.limits = config.carry;
+    leg.max_tool_speed = speed;
+    return time_parametrize({leg});
+  };
+  ASSERT_TRUE(robot.execute(straight(0.030, config.lift_speed)).success);
+  // Nothing is in the way of 20 mm.
+  ExecutionResult moved = robot.execute_until_contact(straight(-0.020, config.lower_speed), config.contact_tolerance);
+  EXPECT_TRUE(moved.success && !moved.contact) << moved.message;
+  // The table is in the way of 30 mm more, after 10.
+  moved = robot.execute_until_contact(straight(-0.030, config.lower_speed), config.contact_tolerance);
+  EXPECT_TRUE(moved.success && moved.contact) << moved.message;
+  EXPECT_NEAR(cell->world().part(1).T_base_part.translation().z(), lying, 0.001);
+  EXPECT_TRUE(cell->verdict().collisions.empty()) << cell->verdict().collisions.front();
+}

@@ -28,6 +28,7 @@ from iwgnet_grasp.perception.merged_depth import (
     merge,
     metres,
     object_mask,
+    own_pixels,
 )
 from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, half_turn, select
 from iwgnet_grasp.training.detector import save_detector
@@ -147,6 +148,28 @@ def test_object_pixels_where_the_empty_scene_has_a_hole():
     assert object_mask(scene(), empty, BOX, 0.004).sum() == 40 * 30
     empty[:] = np.nan
     assert object_mask(scene(), empty, BOX, 0.004).sum() == 0
+
+
+@pytest.mark.parametrize(("x_px", "top"), [(310.0, 0.02), (350.0, 0.045)])
+def test_own_pixels_end_at_a_neighbour_that_the_box_shows(x_px, top):
+    # A bar with a recess of 6 mm along it, 20 mm high, and at its end a higher one.
+    depth = table()
+    depth[210:230, 300:340] = TABLE - 0.02
+    depth[216:224, 305:335] = TABLE - 0.014
+    depth[200:240, 340:360] = TABLE - 0.045
+    mask = object_mask(depth, table(), BOX, 0.004)
+    grasp = GraspRectangle(x_px, 220.0, math.pi / 2, 25.0, 0.5)
+    own = own_pixels(depth, mask, BOX, grasp, 0.008)
+    expected = np.zeros(depth.shape, bool)
+    expected[210:230, 300:340] = top == 0.02
+    expected[200:240, 340:360] = top != 0.02
+    np.testing.assert_array_equal(own, expected[BOX.slices])
+
+
+def test_own_pixels_of_a_grasp_beside_the_object_are_all():
+    mask = object_mask(scene(), table(), BOX, 0.004)
+    grasp = GraspRectangle(100.0, 100.0, 0.0, 25.0, 0.5)
+    assert own_pixels(scene(), mask, BOX, grasp, 0.008) is mask
 
 
 def test_centroid_is_the_mean_pixel():

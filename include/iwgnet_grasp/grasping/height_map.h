@@ -12,7 +12,8 @@ class HeightMap {
   // Empty map: everything at z = 0.
   HeightMap() = default;
   // depth: CV_32FC1 m, NaN invalid; the highest point of each cell counts; cells without any
-  // measurement take the highest of their measured neighbours. Points outside the workspace
+  // measurement take the lowest of their measured neighbours: a stereo camera sees least beside a
+  // high edge, in the shadow that it throws on what lies below. Points outside the workspace
   // rectangle (widened by `border`) are left out: it lets the fingers of a grasp at the rim be
   // checked. Throws Error when image and camera do not match.
   HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,

@@ -1,8 +1,9 @@
 // One pick: approach, grasp, lift, transfer, release, back to observing.
 //
-// The motion is planned whole before the arm moves and executed as three trajectories: observing ->
-// grasp, grasp -> tray slot, tray slot -> observing. Where they go straight up or down the tool is
-// slow; in between it passes corners without stopping.
+// The motion is planned whole before the arm moves and executed as four trajectories: observing ->
+// grasp, grasp -> over the tray slot, slowly down until the part meets something, tray slot ->
+// observing. Where they go straight up or down the tool is slow; in between it passes corners
+// without stopping.
 #pragma once
 
 #include <functional>
@@ -18,6 +19,7 @@ namespace iwgnet_grasp::motion {
 struct ExecutionResult {
   bool success = false;
   std::string message;
+  bool contact = false;  // of execute_until_contact(): stopped before the end
 };
 
 struct GripResult {
@@ -34,6 +36,10 @@ class Robot {
   virtual ~Robot() = default;
   virtual JointVector joints() = 0;
   virtual ExecutionResult execute(const Trajectory& trajectory) = 0;
+  // The same, but an arm that a joint of is held back by more than path_tolerance (rad) has met
+  // something: it stops there, and that is a success.
+  virtual ExecutionResult execute_until_contact(const Trajectory& trajectory,
+                                                const JointVector& path_tolerance) = 0;
   virtual GripResult grip(double gap_m, double force_n) = 0;
   // Starts the gripper moving; a robot that can returns at once, so that the arm moves meanwhile.
   // Default: waits.
@@ -55,10 +61,12 @@ struct PickPlaceConfig {  // config/motion.yaml
   double held_gap_min;            // m, a smaller gap after closing means nothing is held
   double held_length, held_radius;  // m, capsule that stands for a held part
   double held_reach;              // m from a part's centroid to its far end, at most
-  double held_thickness, held_height;  // m, at most, lying flat and standing on its edge
-  double max_hang;                // m, most room that is left for it under the finger tips
+  double max_hang;                // m, a part reaches no farther below the finger tips
   double release_margin;          // m, fingers open by this much beyond the object
   double release_height;          // m, part's lowest point above the tray floor when letting go
+  double max_fall;                // m, by how much a part may reach less far down than was assumed
+  double lower_speed;             // m/s of the tool where that may happen
+  JointVector contact_tolerance;  // rad, joints held back by more have met something
 };
 PickPlaceConfig load_pick_place_config(const std::string& config_dir);  // Throws Error.
 
@@ -87,7 +95,8 @@ struct PickResult {
 
 // The gripper opens before, closes between `approach` and `carry`, lets go before `retreat`.
 struct PickPlan {
-  Trajectory approach, carry, retreat;
+  Trajectory approach, carry, lower, retreat;
+  JointPath up, home;  // what `retreat` goes along
 };
 
 class PickAndPlace {
@@ -112,13 +121,13 @@ class PickAndPlace {
     bool lengthwise = false;  // its long axis lies along the closing direction
     double offset = 0.0;      // m from the grasp to its centroid, across the closing direction, in
                               // the direction of closing x approach
-    double hang = 0.0;        // m below the finger tips, at most: by its height, flat or on its edge,
-                              // and by the slope of its upper side against the gripper; no lower than
-                              // the table
+    double hang = 0.0;        // m below the finger tips, at most: it lies on the table or higher
   };
   HeldPart held_part(const Pose& T_base_tcp, double width, const Eigen::Vector3d& centroid) const;
   JointVector start_of(Robot& robot) const;
-  ExecutionResult move(Robot& robot, const Trajectory& trajectory);
+  ExecutionResult move(Robot& robot, const Trajectory& trajectory, bool until_contact = false);
+  // The planned way home from where the part met something; empty when it collides.
+  Trajectory retreat_from(const JointVector& q, const PickPlan& plan) const;
   // The fastest trajectory along the legs that is free of collision: corners are cut less where
   // cutting them collides. Empty when even stops at the corners collide; `why` says with what.
   Trajectory timed(std::vector<PathLeg> legs, std::string& why) const;

@@ -103,11 +103,16 @@ class SimulatedRobot : public motion::Robot {
   explicit SimulatedRobot(SimulatedCell& cell) : cell_(cell) {}
   JointVector joints() override;
   motion::ExecutionResult execute(const motion::Trajectory& trajectory) override;
+  motion::ExecutionResult execute_until_contact(const motion::Trajectory& trajectory,
+                                                const JointVector& path_tolerance) override;
   motion::GripResult grip(double gap_m, double force_n) override;
   motion::GripResult preset(double gap_m, double force_n) override;
   double gap() override;
 
  private:
+  motion::ExecutionResult follow(const motion::Trajectory& trajectory,
+                                 const TrajectoryTolerances& tolerances);
+
   SimulatedCell& cell_;
 };
 

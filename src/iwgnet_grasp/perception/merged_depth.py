@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from iwgnet_grasp.perception.types import Box, GraspRectangle, PerceptionError, Window
+
+LEAST_SHARE = 0.15  # of a box's pixels, that a part seen in it has
 
 
 def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
@@ -90,6 +93,31 @@ def object_mask(
         empty = np.where(known, empty, np.median(empty[known]))
     with np.errstate(invalid="ignore"):
         return empty - measured > min_height
+
+
+def own_pixels(
+    depth: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangle, step: float
+) -> np.ndarray:
+    """Of an object's box (object_mask) what belongs to the part at the grasp, bool of mask's shape.
+
+    In piles a box shows neighbours, too. A part's pixels hang together without a step in depth of
+    more than `step` (m) from one to the next: more than its recesses, less than its thickness.
+    All of the mask where the grasp has no pixel of it, or few hang together.
+    """
+    rows, columns = np.nonzero(mask)
+    if rows.size == 0:
+        return mask
+    distances = np.hypot(columns + box.x - grasp.x_px, rows + box.y - grasp.y_px)
+    seed = int(np.argmin(distances))
+    if distances[seed] > grasp.width_px / 2:
+        return mask
+    surface = np.where(mask, depth[box.slices], np.float32(0)).astype(np.float32)
+    barred = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
+    fill = 4 | cv2.FLOODFILL_MASK_ONLY | (2 << 8)
+    start = int(columns[seed]), int(rows[seed])
+    cv2.floodFill(surface, barred, start, 0, step, step, fill)
+    own = barred[1:-1, 1:-1] == 2
+    return own if own.sum() > LEAST_SHARE * mask.sum() else mask
 
 
 def centroid(mask: np.ndarray, box: Box) -> tuple[float, float, int]:

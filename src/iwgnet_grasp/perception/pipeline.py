@@ -19,6 +19,7 @@ from iwgnet_grasp.perception.merged_depth import (
     grasp_depth,
     metres,
     object_mask,
+    own_pixels,
 )
 from iwgnet_grasp.perception.types import (
     Detection,
@@ -66,6 +67,7 @@ class PerceptionConfig:
     min_distance_px: float
     min_angle_rad: float
     min_height: float
+    max_step: float
     grasp_depth_radius_px: float
 
     @staticmethod
@@ -90,6 +92,7 @@ class PerceptionConfig:
             min_distance_px=float(grasps["min_distance_px"]),
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
             min_height=float(pixels["min_height"]),
+            max_step=float(pixels["max_step"]),
             grasp_depth_radius_px=float(pixels["grasp_depth_radius_px"]),
         )
 
@@ -164,7 +167,6 @@ class Perception:
     ) -> ObjectGrasps:
         config, box = self.config, detection.box
         mask = object_mask(depth, empty_depth, box, config.min_height)
-        u, v, pixels = centroid(mask, box)
         grasps = [
             replace(
                 grasp,
@@ -178,6 +180,9 @@ class Perception:
                 config.min_angle_rad,
             )
         ]
+        if grasps:
+            mask = own_pixels(depth, mask, box, grasps[0], config.max_step)
+        u, v, pixels = centroid(mask, box)
         return ObjectGrasps(
             object_id=object_id,
             label=detection.label,
