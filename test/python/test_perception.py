@@ -23,6 +23,7 @@ from iwgnet_grasp.perception import (
 from iwgnet_grasp.perception.detector import Detector
 from iwgnet_grasp.perception.merged_depth import (
     centroid,
+    covered_share,
     crop_window,
     grasp_depth,
     merge,
@@ -170,6 +171,23 @@ def test_own_pixels_of_a_grasp_beside_the_object_are_all():
     mask = object_mask(scene(), table(), BOX, 0.004)
     grasp = GraspRectangle(100.0, 100.0, 0.0, 25.0, 0.5)
     assert own_pixels(scene(), mask, BOX, grasp, 0.008) is mask
+
+
+def test_a_part_is_covered_where_something_higher_stands_beside_it():
+    # A bar of 60 x 20 px with a bar across its middle that is 20 px wide and 25 mm higher.
+    depth = table()
+    depth[210:230, 300:360] = TABLE - 0.02
+    crossing = depth.copy()
+    crossing[200:240, 320:340] = TABLE - 0.045
+    left = np.zeros((40, 60), bool)
+    left[10:30, 0:20] = True  # what is seen of the lower bar on the left
+    assert covered_share(depth, left, BOX, 0.008) == 0.0
+    share = covered_share(crossing, left, BOX, 0.008)
+    # One of the three sides that the box shows, all of about 20 px.
+    assert 0.2 < share < 0.5
+    top = np.zeros((40, 60), bool)
+    top[:, 20:40] = True
+    assert covered_share(crossing, top, BOX, 0.008) == 0.0
 
 
 def test_centroid_is_the_mean_pixel():

@@ -7,6 +7,7 @@ import numpy as np
 
 from iwgnet_grasp.perception.types import Box, GraspRectangle, PerceptionError, Window
 
+OUTLINE_PX = 9  # twice the width of the strip around a part that tells what lies on it
 LEAST_SHARE = 0.15  # of a box's pixels, that a part seen in it has
 
 
@@ -118,6 +119,20 @@ def own_pixels(
     cv2.floodFill(surface, barred, start, 0, step, step, fill)
     own = barred[1:-1, 1:-1] == 2
     return own if own.sum() > LEAST_SHARE * mask.sum() else mask
+
+
+def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) -> float:
+    """Share of a part's outline at which another surface stands more than `step` (m) higher.
+
+    mask: own_pixels of the part. 0 for a part that nothing lies on or leans against.
+    """
+    surface = np.where(mask, depth[box.slices], np.float32(np.inf)).astype(np.float32)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OUTLINE_PX, OUTLINE_PX))
+    near = cv2.erode(surface, around, borderValue=np.inf)  # the part's nearest surface
+    outline = np.isfinite(near) & ~mask & np.isfinite(depth[box.slices])
+    if not outline.any():
+        return 0.0
+    return float(np.mean(depth[box.slices][outline] < near[outline] - step))
 
 
 def centroid(mask: np.ndarray, box: Box) -> tuple[float, float, int]:

@@ -15,6 +15,7 @@ from iwgnet_grasp.data.letterbox import Region, checked_region
 from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.merged_depth import (
     centroid,
+    covered_share,
     crop_window,
     grasp_depth,
     metres,
@@ -68,6 +69,7 @@ class PerceptionConfig:
     min_angle_rad: float
     min_height: float
     max_step: float
+    covered_scale: float
     grasp_depth_radius_px: float
 
     @staticmethod
@@ -93,6 +95,7 @@ class PerceptionConfig:
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
             min_height=float(pixels["min_height"]),
             max_step=float(pixels["max_step"]),
+            covered_scale=float(pixels["covered_scale"]),
             grasp_depth_radius_px=float(pixels["grasp_depth_radius_px"]),
         )
 
@@ -182,6 +185,9 @@ class Perception:
         ]
         if grasps:
             mask = own_pixels(depth, mask, box, grasps[0], config.max_step)
+            covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
+            free = math.exp(-covered * covered)
+            grasps = [replace(grasp, quality=grasp.quality * free) for grasp in grasps]
         u, v, pixels = centroid(mask, box)
         return ObjectGrasps(
             object_id=object_id,
