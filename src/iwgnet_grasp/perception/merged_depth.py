@@ -101,24 +101,25 @@ def own_pixels(
 ) -> np.ndarray:
     """Of an object's box (object_mask) what belongs to the part at the grasp, bool of mask's shape.
 
-    In piles a box shows neighbours, too. A part's pixels hang together without a step in depth of
-    more than `step` (m) from one to the next: more than its recesses, less than its thickness.
-    All of the mask where the grasp has no pixel of it, or few hang together.
+    A part's pixels hang together without a step in depth of more than `step` (m) from one to the
+    next: more than its recesses, less than its thickness. None where the grasp has no pixel of the
+    mask, or few hang together.
     """
+    none = np.zeros_like(mask)
     rows, columns = np.nonzero(mask)
     if rows.size == 0:
-        return mask
+        return none
     distances = np.hypot(columns + box.x - grasp.x_px, rows + box.y - grasp.y_px)
     seed = int(np.argmin(distances))
     if distances[seed] > grasp.width_px / 2:
-        return mask
+        return none
     surface = np.where(mask, depth[box.slices], np.float32(0)).astype(np.float32)
     barred = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
     fill = 4 | cv2.FLOODFILL_MASK_ONLY | (2 << 8)
     start = int(columns[seed]), int(rows[seed])
     cv2.floodFill(surface, barred, start, 0, step, step, fill)
     own = barred[1:-1, 1:-1] == 2
-    return own if own.sum() > LEAST_SHARE * mask.sum() else mask
+    return own if own.sum() > LEAST_SHARE * mask.sum() else none
 
 
 def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) -> float:

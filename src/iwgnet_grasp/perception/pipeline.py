@@ -32,6 +32,7 @@ from iwgnet_grasp.perception.types import (
 )
 
 PACKAGE = Path(__file__).resolve().parents[3]
+NOBODY = -1
 DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
 
 
@@ -143,12 +144,7 @@ class Perception:
                 np.stack([w.depth for w in windows]), np.stack([w.empty for w in windows])
             )
         estimated = time.perf_counter()
-        objects = tuple(
-            self._object(i, detection, window, grasps, depth, empty_depth)
-            for i, (detection, window, grasps) in enumerate(
-                zip(detections, windows, estimates, strict=True)
-            )
-        )
+        objects = self._objects(detections, windows, estimates, depth, empty_depth)
         end = time.perf_counter()
         seconds = {
             "check": checked - start,
@@ -159,35 +155,69 @@ class Perception:
         }
         return Look(color, depth, empty_depth, objects, windows, seconds)
 
+    def _objects(
+        self,
+        detections: Sequence[Detection],
+        windows: Sequence[Window],
+        estimates: Sequence[Sequence[Any]],
+        depth: np.ndarray,
+        empty_depth: np.ndarray,
+    ) -> tuple[ObjectGrasps, ...]:
+        config = self.config
+        seen = [object_mask(depth, empty_depth, d.box, config.min_height) for d in detections]
+        grasps = [
+            self._grasps(*args, depth)
+            for args in zip(detections, windows, estimates, seen, strict=True)
+        ]
+        # In piles a box shows neighbours, too: what hangs together with another object's best
+        # grasp is that object's.
+        owner = np.full(depth.shape, NOBODY, np.int16)
+        for i, detection in enumerate(detections):
+            if grasps[i]:
+                box, step = detection.box, config.max_step
+                own = own_pixels(depth, seen[i], box, grasps[i][0], step)
+                free = owner[box.slices] == NOBODY
+                owner[box.slices][own & free] = i
+        objects = []
+        for i, detection in enumerate(detections):
+            owned = owner[detection.box.slices]
+            mask = seen[i] & ((owned == i) | (owned == NOBODY))
+            objects.append(self._object(i, detection, mask, grasps[i], depth))
+        return tuple(objects)
+
+    def _grasps(
+        self,
+        detection: Detection,
+        window: Window,
+        estimates: Sequence[Any],
+        seen: np.ndarray,
+        depth: np.ndarray,
+    ) -> list[GraspRectangle]:
+        config = self.config
+        kept = select(
+            [in_image(estimate, window) for estimate in estimates],
+            detection,
+            config.candidates,
+            config.min_distance_px,
+            config.min_angle_rad,
+        )
+        radius = config.grasp_depth_radius_px
+        return [
+            replace(grasp, depth_m=grasp_depth(depth, seen, detection.box, grasp, radius))
+            for grasp in kept
+        ]
+
     def _object(
         self,
         object_id: int,
         detection: Detection,
-        window: Window,
-        estimates: Sequence[Any],
+        mask: np.ndarray,
+        grasps: Sequence[GraspRectangle],
         depth: np.ndarray,
-        empty_depth: np.ndarray,
     ) -> ObjectGrasps:
         config, box = self.config, detection.box
-        mask = object_mask(depth, empty_depth, box, config.min_height)
-        grasps = [
-            replace(
-                grasp,
-                depth_m=grasp_depth(depth, mask, box, grasp, config.grasp_depth_radius_px),
-            )
-            for grasp in select(
-                [in_image(estimate, window) for estimate in estimates],
-                detection,
-                config.candidates,
-                config.min_distance_px,
-                config.min_angle_rad,
-            )
-        ]
-        if grasps:
-            mask = own_pixels(depth, mask, box, grasps[0], config.max_step)
-            covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
-            free = math.exp(-covered * covered)
-            grasps = [replace(grasp, quality=grasp.quality * free) for grasp in grasps]
+        covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
+        free = math.exp(-covered * covered)
         u, v, pixels = centroid(mask, box)
         return ObjectGrasps(
             object_id=object_id,
@@ -198,7 +228,7 @@ class Perception:
             centroid_v_px=v,
             centroid_depth_m=float(np.median(depth[box.slices][mask])) if pixels else math.nan,
             valid_pixels=pixels,
-            grasps=tuple(grasps),
+            grasps=tuple(replace(grasp, quality=grasp.quality * free) for grasp in grasps),
         )
 
 
