@@ -62,7 +62,7 @@ def train(
         "results/training"
     ),
     epochs: Annotated[int, typer.Option(min=1)] = 30,
-    batch: Annotated[int, typer.Option(min=1, help="Images a step and device.")] = 16,
+    batch: Annotated[int, typer.Option(min=1, help="Images a step and device.")] = 8,
     learning_rate: Annotated[float, typer.Option(min=1e-7)] = 2e-3,
     split: Annotated[
         Split, typer.Option(help="Hold out whole objects (or scenes), or single images.")

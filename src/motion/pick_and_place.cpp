@@ -560,8 +560,9 @@ PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
   if (!released.success)
     return fail(PickReason::kExecutionFailed, "the gripper did not let go: " + released.message);
   begin("return");
-  const Trajectory early = contact ? retreat_from(start_of(robot), plan) : Trajectory();
-  moved = move(robot, early.empty() ? plan.retreat : early);
+  const Trajectory retreat = contact ? retreat_from(start_of(robot), plan) : plan.retreat;
+  if (retreat.empty()) return observe(robot);
+  moved = move(robot, retreat);
   if (!moved.success) return fail(PickReason::kExecutionFailed, "the part is in the tray; return: " + moved.message);
   return result;
 }

@@ -81,15 +81,29 @@ TEST(HeightMap, MaxInLooksIntoTheTurnedRectangleOnly) {
   EXPECT_NEAR(heights.max_in({0.5, 0.0}, -yaw, {0.09, 0.01}), 0.0, 1e-3);
 }
 
-TEST(HeightMap, HolesTakeTheHighestNeighbour) {
+TEST(HeightMap, HolesAreFilledFromAround) {
   Table table;
   table.add({0.08, 0.08, 0.03}, Pose(Eigen::Translation3d(0.5, 0.0, 0.015)));
   cv::Mat depth = table.depth();
-  // A hole over the box's right rim: unknown ground must not look free.
-  depth(cv::Rect(665, 380, 30, 40)).setTo(kNaN);
+  // A hole over the box's right rim, as wide on both sides of it.
+  depth(cv::Rect(669, 380, 30, 40)).setTo(kNaN);
   const HeightMap heights = table.heights(depth);
   EXPECT_NEAR(heights.at(0.535, 0.0), 0.03, 1e-3);
   EXPECT_NEAR(heights.at(0.56, 0.0), 0.0, 1e-3);
+}
+
+TEST(HeightMap, AStereoShadowBesideAnEdgeLiesLow) {
+  Table table;
+  table.add({0.08, 0.08, 0.03}, Pose(Eigen::Translation3d(0.5, 0.0, 0.015)));
+  cv::Mat depth = table.depth();
+  // What the other imager does not see beside the right rim: one cell of the map.
+  const HeightMap whole = table.heights(depth);
+  double edge = 0.535;
+  while (whole.at(edge, 0.0) > 0.015) edge += 0.001;
+  for (int v = 380; v < 420; ++v)
+    for (int u = 640; u < 720; ++u)
+      if (depth.at<float>(v, u) > 0.59f && 0.5 + (u - 639.5) * 0.6 / 640.0 < edge + 0.002) depth.at<float>(v, u) = kNaN;
+  EXPECT_NEAR(table.heights(depth).at(edge, 0.0), 0.0, 1e-3);
 }
 
 TEST(HeightMap, NothingMeasuredIsFlat) {

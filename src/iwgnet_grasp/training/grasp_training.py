@@ -48,7 +48,7 @@ class GraspTrainingSettings:
 
     network: str = "iwgnet"
     epochs: int = 30
-    batch: int = 16
+    batch: int = 8
     learning_rate: float = 2e-3
     weight_decay: float = 1e-4
     warm_up: float = 0.05  # share of the steps
