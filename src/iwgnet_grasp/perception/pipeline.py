@@ -32,8 +32,8 @@ from iwgnet_grasp.perception.types import (
 )
 
 PACKAGE = Path(__file__).resolve().parents[3]
-NOBODY = -1
 DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
+NOBODY = -1  # the owner of a pixel that hangs together with no object's best grasp
 
 
 class ObjectDetector(Protocol):
