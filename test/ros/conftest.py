@@ -12,6 +12,7 @@ from iwgnet_grasp.ros.session import Session, free_master_uri
 @pytest.fixture(scope="session")
 def graph(tmp_path_factory):
     """The graph without perception (tests publish topic 2 themselves); its Session."""
+    os.environ.pop("PYTHONUNBUFFERED", None)  # as on most machines
     os.environ["ROS_MASTER_URI"] = free_master_uri()
     log_dir = tmp_path_factory.mktemp("ros_log")
     os.environ["ROS_LOG_DIR"] = str(log_dir)

@@ -72,6 +72,7 @@ class Session:
             _TAG: self._tag,
             "ROS_LOG_DIR": str(self._log_dir),
             "ROSCONSOLE_FORMAT": "[${severity}] ${node}: ${message}",
+            "PYTHONUNBUFFERED": "1",  # roslaunch would keep what it says for itself: the log is read
         }
         with self.log.open("wb") as log:
             self._roslaunch = subprocess.Popen(
