@@ -72,7 +72,7 @@ class Session:
             _TAG: self._tag,
             "ROS_LOG_DIR": str(self._log_dir),
             "ROSCONSOLE_FORMAT": "[${severity}] ${node}: ${message}",
-            "PYTHONUNBUFFERED": "1",  # roslaunch would keep what it says for itself: the log is read
+            "PYTHONUNBUFFERED": "1",  # the log is read while roslaunch writes it
         }
         with self.log.open("wb") as log:
             self._roslaunch = subprocess.Popen(
