@@ -14,6 +14,7 @@ import pytest
 from test_trial_statistics import pick, record
 
 from iwgnet_grasp.cluster import ClusterError, connect
+from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials import batch
 from iwgnet_grasp.trials.batch import BatchError, Run, read_records, read_run, run_trials
 from iwgnet_grasp.trials.command import chosen_scenes
@@ -25,7 +26,7 @@ from iwgnet_grasp.trials.comparison import (
 )
 from iwgnet_grasp.trials.overrides import changed_config
 from iwgnet_grasp.trials.pool import PoolError, run_with_ray
-from iwgnet_grasp.trials.worker import PACKAGE, Conditions
+from iwgnet_grasp.trials.worker import PACKAGE, Conditions, InProcessWorker
 
 RUN = Run(("five_scattered", "ten_stacked"), 2, 10)
 
@@ -253,3 +254,9 @@ def test_a_real_trial_is_replayed_to_the_bit_with_its_film(tmp_path):
     film = Image.open(tmp_path / "replay" / "film.gif")
     assert film.n_frames > 0.8 * len(times)  # frames in which nothing moves may become one
     assert json.loads((tmp_path / "replay" / "trial.json").read_text()) == result.record
+
+
+def test_a_setting_that_makes_no_sense_is_said_in_one_line():
+    with pytest.raises(CellError, match="motion.yaml: key 'max_fall' must be positive") as caught:
+        InProcessWorker(Conditions(overrides={"motion.max_fall": -1.0}))
+    assert "\n" not in str(caught.value)

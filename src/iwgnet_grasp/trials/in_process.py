@@ -46,7 +46,8 @@ class Plan:
 
 
 class InProcessCell:
-    """supervisor.Cell on the simulated cell. Raises CellError when the core cannot be loaded."""
+    """supervisor.Cell on the simulated cell. Raises CellError when the core cannot be loaded or a
+    config is not usable."""
 
     def __init__(
         self,
@@ -64,9 +65,12 @@ class InProcessCell:
         self.backends = perception.backends
         self.on_plan: Callable[[Plan], None] | None = None
         self._priority = PriorityConfig.load(config_dir / "priority.yaml")
-        self.simulated = core.SimulatedCell(str(package_dir), str(config_dir))
-        self._grasp_config = core.load_grasp_pose_config(str(config_dir))
-        self._pick_config = core.load_pick_place_config(str(config_dir))
+        try:
+            self.simulated = core.SimulatedCell(str(package_dir), str(config_dir))
+            self._grasp_config = core.load_grasp_pose_config(str(config_dir))
+            self._pick_config = core.load_pick_place_config(str(config_dir))
+        except core.CoreError as error:
+            raise CellError(str(error)) from None
         self._robot = core.SimulatedRobot(self.simulated)
         self._T_base_color = T_base_color
         self._empty_depth: np.ndarray | None = None
