@@ -16,6 +16,7 @@ _iwgnet_prepend ROS_PACKAGE_PATH "$IWGNET_ROOT/interfaces"
 _iwgnet_prepend ROS_PACKAGE_PATH "$IWGNET_ROOT"
 export ROS_MASTER_URI="${ROS_MASTER_URI:-http://127.0.0.1:11311}"
 if [ -z "${ROS_IP:-}${ROS_HOSTNAME:-}" ]; then export ROS_IP=127.0.0.1; fi
+export PYTHONUNBUFFERED=1  # what is said comes when it is said, in pipes and logs, too
 export ROS_PYTHON_VERSION=3 ROS_DISTRO="${ROS_DISTRO:-debian}"
 unset -f _iwgnet_prepend
 unset _iwgnet_devel
