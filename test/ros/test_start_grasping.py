@@ -82,7 +82,8 @@ class Trial:
             command += [f"--{name}", value]
         self.process = subprocess.Popen(
             command,
-            env={**os.environ, "ROS_MASTER_URI": free_master_uri()},
+            # As scripts/env.sh has it: the lines are read as they come.
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "ROS_MASTER_URI": free_master_uri()},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
