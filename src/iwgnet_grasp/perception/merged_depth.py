@@ -125,7 +125,8 @@ def own_pixels(
 def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) -> float:
     """Share of a part's outline at which another surface stands more than `step` (m) higher.
 
-    mask: own_pixels of the part. 0 for a part that nothing lies on or leans against.
+    mask: (box.height, box.width) bool, what is seen of the part. 0 for a part that nothing lies on
+    or leans against.
     """
     surface = np.where(mask, depth[box.slices], np.float32(np.inf)).astype(np.float32)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OUTLINE_PX, OUTLINE_PX))
