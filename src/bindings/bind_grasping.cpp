@@ -79,8 +79,8 @@ void bind_grasping(py::module_& m) {
                                     cell, config);
       },
       "grasp"_a, "camera"_a, "T_base_camera"_a, "heights"_a, "cell"_a, "config"_a,
-      "Pixel -> camera -> base -> pose (section 2.2, Eq. 5), straight down. Not feasible: "
-      "GraspPose.reason.");
+      "Pixel -> camera -> base -> pose (section 2.2, Eq. 5), leaning with the object. Not "
+      "feasible: GraspPose.reason.");
   m.def(
       "best_grasp_pose",
       [](const std::vector<GraspRectangle>& grasps, const PinholeIntrinsics& camera,
@@ -91,8 +91,7 @@ void bind_grasping(py::module_& m) {
       },
       "grasps"_a, "camera"_a, "T_base_camera"_a, "heights"_a, "cell"_a, "config"_a,
       "centroid"_a = py::none(),
-      "The best feasible pose of the candidates, leaning with the object; else the first with its "
-      "reason.");
+      "The best feasible pose at and beside the candidates; else the first with its reason.");
 }
 
 }  // namespace iwgnet_grasp::bindings

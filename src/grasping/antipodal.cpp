@@ -31,8 +31,9 @@ constexpr double kNominalShare = 0.25;   // of the quality that counts at the ex
 constexpr int kLineSamples = 15;         // pixels looked at along the closing line
 constexpr double kOwnShare = 0.3;        // least share of them that shows the part
 constexpr double kForeignShare = 0.15;   // most that may show another part
-constexpr int kRefinements = 3;              // of the rectangle, until it leads to the wanted pose:
-constexpr double kCenterTolerance = 0.0005;  // m, between the wanted and the executed centre
+constexpr int kRefinements = 3;              // of the rectangle, until the pads close on its middle:
+constexpr double kCenterTolerance = 0.0005;  // m, between the grasp's centre and that of the contacts
+constexpr double kUncentred = 0.5;           // least share of the quality that is left beside the middle
 constexpr double kWidthTolerance = 0.001;    // m, between the labelled width and the pads' gap
 // Contact area and engagement beyond these no longer make a grasp better.
 constexpr double kAmpleArea = 0.15;        // share of the pad
@@ -70,17 +71,23 @@ struct Squeeze {
   double center;     // m, of the contacts along the closing direction, from the grasp's centre
   double area;       // share of the pad that touches, of the lesser side
   double misfit;     // rad, between the closing direction and the contacts' normals and offset
-  double com_across, com_above;  // m, centre of mass from the middle of the contacts
+  double lever;      // m, of the weight about the closing direction
+  double com_above;  // m, centre of mass from the contacts, the rest of that distance
   double radius;     // m, half the diagonal of the common contact patch
 };
+
+// Middle of the closed finger tips, base_link.
+Eigen::Vector3d tips(const GraspPose& pose) {
+  const Eigen::Vector3d approach = pose.T_base_tcp.linear().col(2), tcp = pose.T_base_tcp.translation();
+  return tcp + approach * ((pose.tip_height - tcp.z()) / approach.z());
+}
 
 // shift: m, of the pads across the closing direction.
 std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose, double shift = 0.0) {
   const Eigen::Vector3f along = pose.T_base_tcp.linear().col(0).cast<float>();
   const Eigen::Vector3f across = pose.T_base_tcp.linear().col(1).cast<float>();
-  Eigen::Vector3f center = pose.T_base_tcp.translation().cast<float>();
-  center.z() = static_cast<float>(pose.tip_height);
-  center += across * static_cast<float>(shift);
+  const Eigen::Vector3f up = -pose.T_base_tcp.linear().col(2).cast<float>();
+  const Eigen::Vector3f center = tips(pose).cast<float>() + across * static_cast<float>(shift);
   const float half_width = kPadWidth / 2, half_opening = pose.opening / 2;
   thread_local std::vector<std::array<float, 3>> touched;  // along, across, above the tips
   thread_local std::vector<int> index;
@@ -89,15 +96,16 @@ std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose, dou
   float low = std::numeric_limits<float>::max(), high = -low, rim_low = low, rim_high = high;
   for (Eigen::Index i = 0; i < part.points.cols(); ++i) {
     const Eigen::Vector3f p = part.points.col(i) - center;
-    if (p.z() < -kRim || p.z() > static_cast<float>(kPadHeight) + kRim) continue;
+    const float h = p.dot(up);
+    if (h < -kRim || h > static_cast<float>(kPadHeight) + kRim) continue;
     const float t = p.dot(across);
     if (std::abs(t) > half_width + kRim) continue;
     const float s = p.dot(along);
     if (std::abs(s) > half_opening) continue;
     rim_low = std::min(rim_low, s);
     rim_high = std::max(rim_high, s);
-    if (p.z() < 0.0f || p.z() > static_cast<float>(kPadHeight) || std::abs(t) > half_width) continue;
-    touched.push_back({s, t, p.z()});
+    if (h < 0.0f || h > static_cast<float>(kPadHeight) || std::abs(t) > half_width) continue;
+    touched.push_back({s, t, h});
     index.push_back(static_cast<int>(i));
     low = std::min(low, s);
     high = std::max(high, s);
@@ -144,9 +152,11 @@ std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose, dou
   result.misfit = std::max({slant(0, rim_low < low - kBulge), slant(1, rim_high > high + kBulge),
                             std::atan2(offset, std::max(result.width, 1e-6))});
   const Eigen::Vector2f middle = 0.5f * (inner_low + inner_high);
-  const Eigen::Vector3f com = part.com.cast<float>() - center;
-  result.com_across = std::abs(com.dot(across) - middle.x());
-  result.com_above = std::abs(com.z() - middle.y());
+  const Eigen::Vector3f com =
+      part.com.cast<float>() - (center + across * middle.x() + up * middle.y());
+  const Eigen::Vector3f beside = com - along * com.dot(along);
+  result.lever = std::abs(com.cross(Eigen::Vector3f::UnitZ()).dot(along));
+  result.com_above = std::sqrt(std::max(0.0, beside.squaredNorm() - result.lever * result.lever));
   result.radius = 0.5 * (inner_high - inner_low).cwiseMax(0.0f).norm();
   return result;
 }
@@ -159,12 +169,12 @@ double quality_of(const Squeeze& contact, const GraspPose& pose, double mass,
   const double weight = mass * kGravity;
   if (weight > 2 * config.friction * config.grip_force) return 0.0;
   // Torsion that a soft contact bears: mu N 2/3 r, as of a uniformly loaded disk, on both sides.
-  const double torque = weight * contact.com_across;
+  const double torque = weight * contact.lever;
   const double bearable =
       2 * config.friction * config.grip_force * 2.0 / 3.0 * std::max(contact.radius, 0.001);
   if (torque >= bearable) return 0.0;
   // A height difference loads the contacts only while the tool accelerates.
-  const double distance = std::hypot(contact.com_across, 0.5 * contact.com_above);
+  const double distance = std::hypot(contact.lever, 0.5 * contact.com_above);
   const double balance = std::exp(-std::pow(distance / config.com_scale, 2)) * (1 - torque / bearable);
   const double square = 1 - std::pow(contact.misfit / cone, 2);
   const double area = std::min(1.0, contact.area / kAmpleArea);
@@ -173,7 +183,8 @@ double quality_of(const Squeeze& contact, const GraspPose& pose, double mass,
       std::clamp((pose.opening - contact.width) / pose_config.opening_margin, 0.0, 1.0);
   const double centred = 1 - std::min(1.0, std::abs(contact.center) / pose_config.opening_margin);
   return balance * (0.3 + 0.7 * square) * (0.4 + 0.6 * area) * (0.4 + 0.6 * depth) *
-         (0.6 + 0.4 * room) * (0.5 + 0.5 * centred);
+         (0.6 + 0.4 * room) * (0.5 + 0.5 * centred) *
+         alone_share(pose, contact.width, pose_config);
 }
 
 double fold(double theta) {  // into (-pi/2, pi/2]
@@ -282,13 +293,13 @@ class Labeller {
   std::optional<GraspLabel> evaluate(const Candidate& candidate, const PosedPart& posed,
                                      double mass) const {
     GraspLabel label;
+    Eigen::Vector2d center = candidate.center;
     double surface = candidate.top, width = candidate.width;
     Squeeze contact;
     for (int i = 0; i < kRefinements; ++i) {
-      const Eigen::Vector2d px = pixel(candidate.center, surface);
-      const Eigen::Vector2d ahead = pixel(candidate.center + candidate.along * 0.001, surface) - px;
-      const double z = (T_camera_base_ * Eigen::Vector3d(candidate.center.x(), candidate.center.y(),
-                                                         surface)).z();
+      const Eigen::Vector2d px = pixel(center, surface);
+      const Eigen::Vector2d ahead = pixel(center + candidate.along * 0.001, surface) - px;
+      const double z = (T_camera_base_ * Eigen::Vector3d(center.x(), center.y(), surface)).z();
       label.rectangle = {px.x(), px.y(), fold(std::atan2(-ahead.y(), ahead.x())),
                          width * camera_.fx / z, 1.0, depth_at(px)};
       label.pose = grasp_pose(label.rectangle, camera_, T_base_camera_, heights_, cell_, pose_config_);
@@ -296,11 +307,17 @@ class Labeller {
       const auto touched = squeeze(posed, label.pose);
       if (!touched) return {};
       contact = *touched;
-      const double error = (label.pose.T_base_tcp.translation().head<2>() - candidate.center).norm();
-      const bool settled = error < kCenterTolerance && std::abs(contact.width - width) < kWidthTolerance;
-      surface = label.pose.tip_height + label.pose.engagement;
-      width = contact.width;
+      // What slips or takes a neighbour along does so wherever between the pads it lies.
+      if (i == 0 && quality_of(contact, label.pose, mass, config_, pose_config_) <
+                        config_.min_quality * kUncentred)
+        return {};
+      const bool settled = std::abs(contact.center) < kCenterTolerance &&
+                           std::abs(contact.width - width) < kWidthTolerance;
       if (settled) break;
+      const auto& axes = label.pose.T_base_tcp.linear();
+      center += axes.col(0).head<2>() * contact.center;
+      surface = tips(label.pose).z() - axes(2, 2) * label.pose.engagement;
+      width = contact.width;
     }
     if (width < config_.min_width) return {};
     // A shoulder beside the pads makes a grasp that only works at the exact place.
@@ -375,7 +392,7 @@ AntipodalConfig load_antipodal_config(const std::string& config_dir) {
   };
   config.surface_samples = static_cast<int>(positive("surface_samples"));
   config.friction = positive("friction");
-  config.grip_force = positive("grip_force");
+  config.grip_force = YamlFile(config_dir + "/motion.yaml").get<double>("grip_force");
   config.min_width = positive("min_width");
   config.max_tilt = positive("max_tilt");
   config.min_contact_area = positive("min_contact_area");

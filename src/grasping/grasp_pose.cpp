@@ -34,7 +34,7 @@ constexpr double kSideShare = 0.4;        // of the overlap of finger and object
 constexpr double kAmpleShare = 0.5;       // of the pad's width that touches: more is no better
 constexpr double kTouchless = 0.2;        // of the quality that is left where nothing seems to touch: the
                                           // camera sees sides badly
-constexpr double kView = 0.09;            // m around a grasp, what the gripper's body reaches
+constexpr double kViewAlong = 0.09, kViewAcross = 0.05;  // m around a grasp, what the gripper's body reaches
 constexpr double kPitchScale = 3.0;       // a part that leans along the pads is held as flat: its
                                           // angle counts by so much less
 
@@ -433,15 +433,6 @@ Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
   return {best.x(), best.y()};
 }
 
-GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
-                     const Pose& T_base_camera, const HeightMap& heights,
-                     const CellConfig& cell, const GraspPoseConfig& config) {
-  Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
-  if (located.pose.reason.empty())
-    lower(located.pose, Pose::Identity(), heights, located.axes, located.surface, 0.0, config);
-  return located.pose;
-}
-
 namespace {
 
 // The located grasp with an approach that follows the object's surface.
@@ -480,17 +471,14 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
       T_base_view.linear().col(0) = x.normalized();
       T_base_view.linear().col(2) = x.cross(y).normalized();
       T_base_view.linear().col(1) = T_base_view.linear().col(2).cross(T_base_view.linear().col(0));
-      const HeightMap view = heights.seen_from(T_base_view, kView);
+      const HeightMap view = heights.seen_from(T_base_view, {kViewAlong, kViewAcross});
       const GraspAxes axes{{0, 0}, {1, 0}, {0, 1}};
       const double surface = surface_height(view, axes, std::min(pose.width, config.max_opening));
       const double table = -at.z() / T_base_view.linear()(2, 2);
       lower(pose, T_base_view, view, axes, surface, table, config);
     }
     if (pose.feasible) {
-      // What lies below the upper edge of a leaning object is hidden, not necessarily taken.
-      const double hidden = 2 * pose.engagement * std::abs(std::tan(lean.roll));
-      const double beside = std::max(0.0, pose.contact - pose.width - hidden - kSnug) / config.spread_scale;
-      pose.quality *= std::exp(-beside * beside) * (kTouchless + (1 - kTouchless) * pose.touch);
+      pose.quality *= alone_share(pose, pose.width, config) * (kTouchless + (1 - kTouchless) * pose.touch);
       return pose;
     }
     if (first.reason.empty()) first = pose;
@@ -498,7 +486,29 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
   return first;
 }
 
+Slope slope_of(const Located& located, const HeightMap& heights, const GraspPoseConfig& config) {
+  return surface_slope(heights, located.axes.center, located.axes.along, located.surface,
+                       std::min(located.pose.width, config.max_opening), std::tan(config.max_roll),
+                       std::tan(config.max_pitch));
+}
+
 }  // namespace
+
+double alone_share(const GraspPose& pose, double width, const GraspPoseConfig& config) {
+  // What lies below the upper edge of a leaning object is hidden, not necessarily taken.
+  const double roll = std::asin(std::clamp(pose.T_base_tcp.linear()(2, 0), -1.0, 1.0));
+  const double hidden = 2 * pose.engagement * std::abs(std::tan(roll));
+  const double beside = std::max(0.0, pose.contact - width - hidden - kSnug) / config.spread_scale;
+  return std::exp(-beside * beside);
+}
+
+GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
+                     const Pose& T_base_camera, const HeightMap& heights, const CellConfig& cell,
+                     const GraspPoseConfig& config) {
+  const Located located = locate(grasp, camera, T_base_camera, heights, cell, config);
+  if (!located.pose.reason.empty()) return located.pose;
+  return leaning(located, slope_of(located, heights, config), heights, config);
+}
 
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
@@ -514,8 +524,7 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
     return pose;
   };
   const double width = std::min(located.pose.width, config.max_opening);
-  const Slope slope = surface_slope(heights, located.axes.center, located.axes.along, located.surface,
-                                    width, std::tan(config.max_roll), std::tan(config.max_pitch));
+  const Slope slope = slope_of(located, heights, config);
   GraspPose best = with_lever(leaning(located, slope, heights, config));
   for (const double shift : config.shifts) {
     Located beside = located;

@@ -107,45 +107,60 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
     }
   }
   fill_unknown(grid_, true);
+  highest_ = *std::max_element(grid_.begin<float>(), grid_.end<float>());
 }
 
-HeightMap HeightMap::seen_from(const Pose& T_base_view, double half) const {
+HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& half) const {
   HeightMap view;
   view.resolution_ = resolution_;
   view.outside_ = -std::numeric_limits<double>::infinity();
-  view.origin_.setConstant(-half + resolution_ / 2);
-  const int size = static_cast<int>(std::ceil(2 * half / resolution_));
-  view.grid_.create(size, size, CV_32FC1);
+  view.origin_ = -half.array() + resolution_ / 2;
+  const int columns = static_cast<int>(std::ceil(2 * half.x() / resolution_));
+  const int rows = static_cast<int>(std::ceil(2 * half.y() / resolution_));
+  view.grid_.create(rows, columns, CV_32FC1);
   view.grid_.setTo(kUnknown);
   const Pose T_view_base = T_base_view.inverse();
-  // A point that the view shows may lie this far beside it on the table.
-  const Eigen::Vector2d center = T_base_view.translation().head<2>();
-  const double reach = half * M_SQRT2 + kTallest * T_base_view.linear().col(2).head<2>().norm();
-  const auto index = [&](double value, double origin, int last) {
-    return std::clamp(static_cast<int>((value - origin) / resolution_), 0, last);
-  };
-  const int c0 = index(center.x() - reach, origin_.x(), grid_.cols - 1);
-  const int c1 = index(center.x() + reach, origin_.x(), grid_.cols - 1);
-  const int r0 = index(center.y() - reach, origin_.y(), grid_.rows - 1);
-  const int r1 = index(center.y() + reach, origin_.y(), grid_.rows - 1);
-  for (int r = r0; r <= r1 && !grid_.empty(); ++r)
-    for (int c = c0; c <= c1; ++c) {
-      const float top = grid_.at<float>(r, c);
+  // In cells of the view and, upwards, metres.
+  const float scale = 1.0 / resolution_, step = resolution_;
+  const Eigen::Vector3f units(scale, scale, 1.0f);
+  const Eigen::Matrix3f R = units.asDiagonal() * T_view_base.linear().cast<float>();
+  const Eigen::Vector3f along_column = R.col(0) * step, upwards = R.col(2);
+  const int last_column = grid_.cols - 1, last_row = grid_.rows - 1;
+  for (int r = 0; r <= last_row; ++r) {
+    const Eigen::Vector3d start(origin_.x(), origin_.y() + r * resolution_, 0.0);
+    const Eigen::Vector3f ground = units.cwiseProduct((T_view_base * start).cast<float>()) +
+                                   Eigen::Vector3f(half.x() * scale, half.y() * scale, 0.0f);
+    // The columns from which something between the table and `highest_` comes to lie in the view.
+    float first = 0.0f, last = last_column;
+    for (const int axis : {0, 1}) {
+      const float rise = upwards[axis] * static_cast<float>(highest_);
+      const float low = -ground[axis] - std::max(rise, 0.0f);
+      const float high = (axis ? rows : columns) - ground[axis] - std::min(rise, 0.0f);
+      const float slope = along_column[axis];
+      if (std::abs(slope) < 1e-6f) {
+        if (low > 0.0f || high < 0.0f) last = -1.0f;
+        continue;
+      }
+      first = std::max(first, std::min(low / slope, high / slope));
+      last = std::min(last, std::max(low / slope, high / slope));
+    }
+    const float* row = grid_.ptr<float>(r);
+    const float *before = grid_.ptr<float>(std::max(r - 1, 0)),
+                *after = grid_.ptr<float>(std::min(r + 1, last_row));
+    for (int c = static_cast<int>(std::ceil(first)); c <= static_cast<int>(last); ++c) {
+      const Eigen::Vector3f at = ground + along_column * static_cast<float>(c);
+      const float top = row[c];
       // Down to the lowest neighbour: the wall of a step is seen from the side.
-      float low = top;
-      for (const auto& [dr, dc] : {std::pair{-1, 0}, {1, 0}, {0, -1}, {0, 1}})
-        if (r + dr >= 0 && r + dr < grid_.rows && c + dc >= 0 && c + dc < grid_.cols)
-          low = std::min(low, grid_.at<float>(r + dr, c + dc));
-      for (double z = top; z >= low; z -= resolution_) {
-        const Eigen::Vector3d p = T_view_base * Eigen::Vector3d(origin_.x() + c * resolution_,
-                                                                origin_.y() + r * resolution_, z);
-        const int column = static_cast<int>(std::floor((p.x() + half) / resolution_));
-        const int row = static_cast<int>(std::floor((p.y() + half) / resolution_));
-        if (column < 0 || row < 0 || column >= size || row >= size) continue;
-        float& height = view.grid_.at<float>(row, column);
-        height = std::max(height, static_cast<float>(p.z()));
+      const float low = std::min({top, before[c], after[c], row[std::max(c - 1, 0)],
+                                  row[std::min(c + 1, last_column)]});
+      for (float z = top; z >= low; z -= step) {
+        const Eigen::Vector3f p = at + upwards * z;
+        if (!(p.x() >= 0.0f && p.y() >= 0.0f && p.x() < columns && p.y() < rows)) continue;
+        float& height = view.grid_.ptr<float>(static_cast<int>(p.y()))[static_cast<int>(p.x())];
+        height = std::max(height, p.z());
       }
     }
+  }
   fill_unknown(view.grid_, false);
   return view;
 }

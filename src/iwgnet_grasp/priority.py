@@ -27,7 +27,6 @@ class PriorityConfig:
 
     alpha: float  # weight of D
     beta: float  # weight of G
-    min_quality: float  # a best grasp below it is tried after all others
     failed_radius_px: float
     failed_angle_rad: float
     random_order: bool  # S* is drawn, not computed: for comparison
@@ -39,7 +38,7 @@ class PriorityConfig:
 
     @staticmethod
     def _of(text: dict) -> PriorityConfig:
-        names = ("alpha", "beta", "min_quality", "failed_radius_px", "failed_angle_deg")
+        names = ("alpha", "beta", "failed_radius_px", "failed_angle_deg")
         values = [float(text[name]) for name in names]
         if not all(math.isfinite(value) and value >= 0 for value in values):
             raise ValueError(f"{', '.join(names)} must be finite and >= 0")
@@ -83,13 +82,10 @@ def rank(
     without_failed); the returned objects hold the grasps that are left. The degenerate cases:
     one object, or equal scores -> S* = 1 for all (Eq. 21 is 0/0 there); an object without a
     valid pixel or without depth at its grasp has no S: it goes last with S* = 0 and its reason;
-    an object without any grasp left is dropped. Beyond the paper, whose score does not see the
-    quality of a grasp: an object whose best grasp is below config.min_quality comes after all
-    that are above, by ascending S, with S* = 0 and the reason, and does not count in Eq. 21.
-    With config.random_order `seed` draws S* of the objects that would have been scored.
+    an object without any grasp left is dropped. With config.random_order `seed` draws S* of the
+    objects that would have been scored.
     """
     scored: list[RankedObject] = []
-    doubtful: list[RankedObject] = []
     last: list[RankedObject] = []
     dropped: list[tuple[ObjectGrasps, str]] = []
     for candidate in objects:
@@ -105,20 +101,14 @@ def rank(
         depth_distance = left.grasps[0].depth_m
         distance = centroid_distance(left, left.grasps[0], camera)
         score = config.alpha * depth_distance + config.beta * distance  # Eq. 17
-        quality = left.grasps[0].quality
-        if quality < config.min_quality:
-            reason = f"grasp quality {quality:.2f} is below {config.min_quality:.2f}"
-            doubtful.append(RankedObject(left, depth_distance, distance, score, 0.0, reason))
-        else:
-            scored.append(RankedObject(left, depth_distance, distance, score, math.nan))
+        scored.append(RankedObject(left, depth_distance, distance, score, math.nan))
     priorities = normalised([entry.score for entry in scored])
     if config.random_order:
         priorities = np.random.default_rng(seed).permutation(len(scored)) / max(len(scored) - 1, 1)
         priorities = [float(priority) for priority in priorities]
     scored = [replace(entry, priority=p) for entry, p in zip(scored, priorities, strict=True)]
     scored.sort(key=lambda entry: -entry.priority)  # stable
-    doubtful.sort(key=lambda entry: entry.score)
-    return Ranking(tuple(scored + doubtful + last), tuple(dropped))
+    return Ranking(tuple(scored + last), tuple(dropped))
 
 
 def centroid_distance(

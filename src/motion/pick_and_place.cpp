@@ -191,7 +191,7 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   // Seen by the gripper, which will point straight down over the tray: x closes, z is up.
   Pose T_base_view = T_base_tcp;
   T_base_view.linear().rightCols<2>() *= -1.0;
-  const grasping::HeightMap heights = heights_.seen_from(T_base_view, config_.held_reach);
+  const grasping::HeightMap heights = heights_.seen_from(T_base_view, Eigen::Vector2d::Constant(config_.held_reach));
   const double tip = -kinematics::kPadHeight / 2;
   const double surface = heights.max_in({0, 0}, 0.0, {0.006, 0.006});
 

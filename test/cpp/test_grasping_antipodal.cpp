@@ -185,6 +185,44 @@ TEST(Labels, NeighboursForbidTheGraspsTheyBlock) {
   }
 }
 
+TEST(Labels, TwoPartsBetweenTheFingersAreNoGraspOfOne) {
+  // Both together fit the gripper; what the pads would meet is one side of each.
+  const TriangleMesh mesh = box_mesh({0.12f, 0.016f, 0.024f});
+  const auto across_one = [&](double distance) {
+    Bench bench;
+    const PartGrasps grasps = bench.grasps(mesh);
+    bench.add(mesh, grasps, lying(0.5, 0.0, 0.012));
+    bench.add(mesh, grasps, lying(0.5, distance, 0.012));
+    int count = 0;
+    for (const GraspLabel& label : bench.label())
+      count += std::abs(label.pose.T_base_tcp.linear()(1, 0)) > 0.9;
+    return count;
+  };
+  EXPECT_EQ(across_one(0.017), 0);
+  EXPECT_GT(across_one(0.060), 0);
+}
+
+TEST(Labels, GripperLeansWithATiltedBar) {
+  const TriangleMesh mesh = box_mesh({0.12f, 0.03f, 0.024f});
+  for (const double roll : {0.0, 0.45}) {
+    Bench bench;
+    const PartGrasps grasps = bench.grasps(mesh);
+    const Eigen::Vector3d axis = Eigen::Vector3d::UnitX();
+    const double height = 0.015 * std::sin(roll) + 0.012 * std::cos(roll) + 0.005;
+    Pose pose(Eigen::Translation3d(0.5, 0.0, height));
+    pose.rotate(Eigen::AngleAxisd(roll, axis));
+    bench.add(mesh, grasps, pose);
+    const auto labels = bench.label();
+    ASSERT_FALSE(labels.empty()) << roll;
+    const GraspLabel& best = labels.front();
+    EXPECT_GT(best.rectangle.quality, 0.5) << roll;
+    EXPECT_NEAR(best.pose.width, 0.03, 1e-3) << roll;
+    // The approach against the bar's own vertical.
+    const Eigen::Vector3d up = pose.rotation() * Eigen::Vector3d::UnitZ();
+    EXPECT_LT(std::acos(-best.pose.T_base_tcp.linear().col(2).dot(up)), 0.06) << roll;
+  }
+}
+
 TEST(Labels, ACoveredPartHasNone) {
   Bench bench;
   const TriangleMesh small = box_mesh({0.06f, 0.02f, 0.02f}), lid = box_mesh({0.12f, 0.08f, 0.02f});

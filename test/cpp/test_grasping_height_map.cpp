@@ -55,7 +55,7 @@ TEST(HeightMap, SeenFromAnotherFrameTheSurfaceIsTheSame) {
   Pose T_base_view(Eigen::Translation3d(0.5, 0.0, 0.04));
   T_base_view.rotate(Eigen::AngleAxisd(0.7, Eigen::Vector3d::UnitZ()) *
                      Eigen::AngleAxisd(0.3, Eigen::Vector3d(1, 0.5, 0).normalized()));
-  const HeightMap view = table.heights(table.depth()).seen_from(T_base_view, 0.05);
+  const HeightMap view = table.heights(table.depth()).seen_from(T_base_view, {0.05, 0.05});
   // Planes z = 40 mm and z = 0 along the lines parallel to the view's z axis.
   const auto plane = [&](double x, double y, double z) {
     const Eigen::Vector3d p = T_base_view * Eigen::Vector3d(x, y, 0);

@@ -7,6 +7,7 @@ from torch import nn
 
 from iwgnet_grasp.networks import GRASP_NETWORKS, count_parameters, create_network
 from iwgnet_grasp.networks.feature_fusion import PlainFusion, WeightedFeatureFusion
+from iwgnet_grasp.networks.grasp_network import QUALITY_PRIOR
 from iwgnet_grasp.networks.inception import ImprovedInception
 
 
@@ -141,6 +142,14 @@ def test_maps_have_the_size_of_the_input(name, size):
         maps = create_network(name).eval()(torch.randn(2, 1, *size))
     assert all(m.shape == (2, *size) for m in maps)
     assert maps.q.min() >= 0 and maps.q.max() <= 1
+
+
+@pytest.mark.parametrize("name", GRASP_NETWORKS)
+def test_an_untrained_network_sees_few_grasps(name):
+    torch.manual_seed(0)
+    with torch.no_grad():
+        q = create_network(name).eval()(torch.randn(2, 1, 72, 72)).q
+    assert q.mean() == pytest.approx(QUALITY_PRIOR, rel=0.2)
 
 
 def test_an_item_of_a_batch_does_not_depend_on_the_others():

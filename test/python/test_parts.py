@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from iwgnet_grasp import assets
 from iwgnet_grasp.parts import PartError, add_part, configured_parts, load_part, save_part
-from iwgnet_grasp.parts.families import sum_of
+from iwgnet_grasp.parts.families import Elbow, TurnedPart, sum_of
 from iwgnet_grasp.parts.library import library_axes, make_library, part_from_mesh
 from iwgnet_grasp.parts.solids import ring_sectors, to_manifold
 
@@ -26,7 +26,7 @@ EVERY_PART = pytest.mark.parametrize("part", PARTS.values(), ids=PARTS.keys())
 
 
 def rod_sizes(name):
-    for kind in ("connecting_rods", "unseen_connecting_rods"):
+    for kind in ("connecting_rods", "unseen_connecting_rods", "other_connecting_rods"):
         if name in SETTINGS[kind]["sizes"]:
             return SETTINGS[kind]["sizes"][name]
     raise KeyError(name)
@@ -75,6 +75,21 @@ def test_inertia_against_the_formula_of_a_box():
     np.testing.assert_allclose(
         part.inertia, np.diag([along, across, across]), rtol=1e-6, atol=1e-12
     )
+
+
+def test_a_turned_parts_volume_is_that_of_its_cylinders():
+    steps, bore = ((0.066, 0.008), (0.044, 0.010)), 0.016
+    turned = TurnedPart(steps, bore)
+    exact = sum(np.pi / 4 * (d**2 - bore**2) * length for d, length in steps)
+    assert turned.solid().volume() == pytest.approx(exact, rel=5e-3)  # circles are polygons
+    assert TurnedPart(steps, 0).solid().volume() == pytest.approx(
+        exact + np.pi / 4 * bore**2 * 0.018, rel=5e-3
+    )
+
+
+def test_an_elbow_reaches_as_far_as_its_legs():
+    x, y, _ = Elbow(0.02, (0.07, 0.04), 90.0).solid().bounding_box()[3:]
+    assert (x, y) == pytest.approx((0.07, 0.04), abs=1e-6)
 
 
 @EVERY_PART

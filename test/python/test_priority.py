@@ -26,7 +26,6 @@ CAMERA = CameraIntrinsics(640.0, 640.0, 639.5, 399.5)
 CONFIG = PriorityConfig(  # Eq. 17 as it is, with equal weights
     alpha=1.0,
     beta=1.0,
-    min_quality=0.0,
     failed_radius_px=15.0,
     failed_angle_rad=math.radians(25.0),
     random_order=False,
@@ -116,21 +115,6 @@ def test_object_without_depth_at_its_grasp_goes_last():
     assert "grasp point" in ranking.objects[1].reason
 
 
-def test_doubtful_grasps_come_after_all_others():
-    objects = [
-        thing(0, grasp(depth=0.55, quality=0.1), depth=0.55),
-        thing(1, grasp(depth=0.54, quality=0.2), depth=0.54),
-        thing(2, grasp(depth=0.58, quality=0.3), depth=0.58),
-        thing(3, grasp(depth=0.57, quality=0.9), depth=0.57),
-    ]
-    careful = rank(objects, CAMERA, replace(CONFIG, min_quality=0.3))
-    assert ids(careful) == [3, 2, 1, 0]
-    assert [e.priority for e in careful.objects] == [1.0, 0.0, 0.0, 0.0]
-    assert careful.objects[2].score == pytest.approx(0.54)
-    assert "quality 0.20 is below 0.30" in careful.objects[2].reason
-    assert ids(rank(objects, CAMERA, CONFIG)) == [1, 0, 3, 2]  # the paper's order
-
-
 def test_object_without_grasp_is_dropped_with_its_reason():
     ranking = rank([thing(0), thing(1, grasp())], CAMERA, CONFIG)
     assert ids(ranking) == [1]
@@ -199,13 +183,11 @@ def test_config_of_the_package_loads():
         ("alpha: 1", "missing"),
         ("alpha: x", "not a valid"),
         (
-            "alpha: -1\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1\n"
-            "random_order: false",
+            "alpha: -1\nbeta: 1\nfailed_radius_px: 1\nfailed_angle_deg: 1\nrandom_order: false",
             "finite and >= 0",
         ),
         (
-            "alpha: .nan\nbeta: 1\nmin_quality: 0\nfailed_radius_px: 1\nfailed_angle_deg: 1\n"
-            "random_order: false",
+            "alpha: .nan\nbeta: 1\nfailed_radius_px: 1\nfailed_angle_deg: 1\nrandom_order: false",
             "finite and >= 0",
         ),
     ],

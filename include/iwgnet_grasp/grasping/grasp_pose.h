@@ -79,20 +79,25 @@ double width_in_metres(double width_px, double depth_m, double fx_px);
 
 // Pixel -> camera -> base -> pose. The object's surface is the highest that `heights` shows along
 // the closing line, so that a centre over a bore or without a measurement still finds the object.
-// The tips go as deep as the insertion depth allows and what lies under their sweep from the
-// opening to the object permits; where a neighbour is close, the opening shrinks. Never throws for a bad grasp: feasible is false and
-// reason says why (no depth, outside the workspace, wider than the gripper, fingers collide).
+// Where its upper side slopes, the gripper leans with it as far as what lies around it permits, so
+// that both pads meet the object flat: a part that is gripped by its edges turns between the pads as
+// soon as it leaves the table. The tips go as deep as the insertion depth allows and what lies under
+// their sweep from the opening to the object permits; where a neighbour is close, the opening
+// shrinks. quality is the network's, less what is measured: the angle left between pads and object,
+// what the fingers would take along (alone_share), and pads that touch by their edge only. Never
+// throws for a bad grasp: feasible is false and reason says why (no depth, outside the workspace,
+// wider than the gripper, fingers collide).
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                      const Pose& T_base_camera, const HeightMap& heights,
                      const CellConfig& cell, const GraspPoseConfig& config);
 
-// The same with an approach that follows the object: where its upper side slopes, the gripper leans
-// with it as far as what lies around it permits, so that both pads meet the object flat. A part that
-// is gripped by its edges turns between the pads as soon as it leaves the table. Places beside the
-// grasp along the pads are tried as well. quality is the network's, less what is measured: the angle
-// left between pads and object, a neighbour that the fingers would have to take along, the distance
-// from the network's place and, along the pads, from the object's centroid (base_link) where that is
-// known, each exp(-(amount / scale)^2), and pads that touch by their edge only.
+// What is left of a grasp's quality, in [0, 1], where the fingers have to stand `pose.contact` apart
+// for an object that is `width` (m) wide: what else lies between them comes along.
+double alone_share(const GraspPose& pose, double width, const GraspPoseConfig& config);
+
+// grasp_pose() at the grasp's place and beside it along the pads, whichever is best: quality also
+// falls with the distance from the network's place and, along the pads, from the object's centroid
+// (base_link) where that is known, each as exp(-(amount / scale)^2).
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
                              const CellConfig& cell, const GraspPoseConfig& config,

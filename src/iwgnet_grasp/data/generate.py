@@ -251,10 +251,12 @@ class SceneMaker:
         crop = self.settings["crop"]
         if np.count_nonzero(seen) < crop["min_pixels"]:
             return None
-        count, pieces, statistics, _ = cv2.connectedComponentsWithStats(seen.astype(np.uint8))
+        x, y, width, height = cv2.boundingRect(seen.view(np.uint8))
+        window = seen[y : y + height, x : x + width]
+        count, pieces, statistics, _ = cv2.connectedComponentsWithStats(window.astype(np.uint8))
         for i in range(1, count):
             if statistics[i, cv2.CC_STAT_AREA] < crop["min_fragment"]:
-                seen[pieces == i] = False
+                window[pieces == i] = False
         pixels = np.count_nonzero(seen)
         if pixels < crop["min_pixels"] or pixels < crop["min_visible"] * outline_area:
             return None
@@ -299,11 +301,7 @@ def rectangle_row(label: Any) -> list[float]:
 
 def bounding_box(mask: np.ndarray) -> np.ndarray:
     """(4,) x, y, width, height of the smallest box around a mask that is not empty."""
-    columns = np.flatnonzero(mask.any(axis=0))
-    rows = np.flatnonzero(mask.any(axis=1))
-    return np.array(
-        [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1], int
-    )
+    return np.array(cv2.boundingRect(mask.view(np.uint8)), int)
 
 
 def as_detected(box: np.ndarray, image_shape: tuple, crop: dict, rng: np.random.Generator) -> Box:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from iwgnet_grasp.networks.grasp_network import GraspNetwork
+from iwgnet_grasp.networks.grasp_network import GraspNetwork, set_quality_prior
 
 
 class GGCNN(GraspNetwork):
@@ -30,6 +30,7 @@ class GGCNN(GraspNetwork):
         # The four published heads are one convolution with four output channels.
         self.heads = nn.Conv2d(32, 4, 2)
         _xavier(self)
+        set_quality_prior(self.heads)
 
     def raw(self, x: Tensor) -> Tensor:
         return self.heads(self.features(x))
@@ -66,6 +67,7 @@ class GGCNN2(GraspNetwork):
         )
         self.heads = nn.Conv2d(16, 4, 1)
         _xavier(self)
+        set_quality_prior(self.heads)
 
     def raw(self, x: Tensor) -> Tensor:
         return self.heads(self.features(x))

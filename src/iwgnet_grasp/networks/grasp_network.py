@@ -1,5 +1,6 @@
 """What every grasp network is: depth in, four maps of the same size out."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -10,6 +11,9 @@ from torch.nn import functional as F
 # neither clipped nor tied to the input size, so a decoded width is map * WIDTH_REFERENCE_PX in the
 # pixels of the image that went in, whatever was cropped or zoomed before.
 WIDTH_REFERENCE_PX = 100.0
+
+# Mean of the quality over all pixels of a label, about.
+QUALITY_PRIOR = 0.02
 
 
 class GraspMaps(NamedTuple):
@@ -49,6 +53,17 @@ class GraspNetwork(nn.Module):
 
 def count_parameters(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
+
+
+def set_quality_prior(heads: nn.Conv2d) -> None:
+    """Starts the heads with Q = QUALITY_PRIOR everywhere (as Lin et al., Focal Loss, ICCV 2017).
+
+    From Q = 0.5 the first steps would push every feature below zero for the empty table's sake, and
+    ReLU keeps them there: all that is left to tell a grasp is that nothing speaks against it.
+    `heads`: the last convolution, a quarter of its channels for each map, Q first.
+    """
+    quality = heads.bias[: heads.out_channels // 4]
+    nn.init.constant_(quality, math.log(QUALITY_PRIOR / (1 - QUALITY_PRIOR)))
 
 
 def conv_block(

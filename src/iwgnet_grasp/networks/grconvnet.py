@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from iwgnet_grasp.networks.grasp_network import GraspNetwork
+from iwgnet_grasp.networks.grasp_network import GraspNetwork, set_quality_prior
 
 
 class _Residual(nn.Module):
@@ -48,6 +48,7 @@ class GRConvNet(GraspNetwork):
         )
         # The four published heads are one convolution with four output channels.
         self.heads = nn.Conv2d(c, 4, 2)
+        set_quality_prior(self.heads)
 
     def raw(self, x: Tensor) -> Tensor:
         return self.heads(self.decoder(self.residual(self.encoder(x))))

@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from iwgnet_grasp.networks.feature_fusion import PlainFusion, WeightedFeatureFusion
-from iwgnet_grasp.networks.grasp_network import GraspNetwork, conv_block
+from iwgnet_grasp.networks.grasp_network import GraspNetwork, conv_block, set_quality_prior
 from iwgnet_grasp.networks.inception import ImprovedInception
 
 
@@ -62,7 +62,9 @@ class IWGNet(GraspNetwork):
         self.up_2 = _upsample(48, 16, kernel=3)
         self.fuse_2 = fusion(16)
         self.smooth_2 = conv_block(16, 32)
-        self.heads = nn.Sequential(nn.Conv2d(32, 4 * 4, 3, padding=1), nn.PixelShuffle(2))
+        heads = nn.Conv2d(32, 4 * 4, 3, padding=1)
+        set_quality_prior(heads)
+        self.heads = nn.Sequential(heads, nn.PixelShuffle(2))
 
     def raw(self, x: Tensor) -> Tensor:
         half = self.stem(x)

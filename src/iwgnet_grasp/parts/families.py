@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from manifold3d import Manifold
+from manifold3d import CrossSection, Manifold
 
 from iwgnet_grasp.parts.solids import along_x, disc, plate, polygon, ring_sectors
 
@@ -112,6 +112,50 @@ class Prism:
 
     def solid(self) -> Manifold:
         return self.pieces(0.0)[0]
+
+
+@dataclass(frozen=True)
+class TurnedPart:
+    """Coaxial cylinders, one on the other along z, with a bore through all of them."""
+
+    steps: tuple[tuple[float, float], ...]  # diameter, length; from below
+    bore: float  # 0: none
+
+    def solid(self) -> Manifold:
+        body = sum_of(self._stacked([[disc(d)] for d, _ in self.steps]))
+        return body - plate(disc(self.bore), 1.0) if self.bore else body
+
+    def pieces(self, tolerance: float) -> list[Manifold]:
+        if not self.bore:
+            return self._stacked([[disc(d, segments=ROUND)] for d, _ in self.steps])
+        return self._stacked([ring_sectors(self.bore, d, tolerance) for d, _ in self.steps])
+
+    def _stacked(self, outlines: list[list[CrossSection]]) -> list[Manifold]:
+        bottom, solids = 0.0, []
+        for step, (_, length) in zip(outlines, self.steps, strict=True):
+            solids += [plate(outline, length, bottom) for outline in step]
+            bottom += length
+        return solids
+
+
+@dataclass(frozen=True)
+class Elbow:
+    """Two round bars that meet at the origin: one along x, one turned from it about z."""
+
+    diameter: float
+    legs: tuple[float, float]
+    angle: float  # deg between them
+
+    def pieces(self, tolerance: float) -> list[Manifold]:
+        first, second = (
+            along_x(disc(self.diameter, segments=ROUND).extrude(length + self.diameter / 2))
+            for length in self.legs
+        )
+        inwards = (-self.diameter / 2, 0.0, 0.0)  # so that the corner is filled
+        return [first.translate(inwards), second.translate(inwards).rotate((0.0, 0.0, self.angle))]
+
+    def solid(self) -> Manifold:
+        return sum_of(self.pieces(0.0))
 
 
 def sum_of(solids: list[Manifold]) -> Manifold:

@@ -15,7 +15,7 @@ import trimesh
 import yaml
 
 from iwgnet_grasp.parts.connecting_rod import ConnectingRod
-from iwgnet_grasp.parts.families import Bracket, Flange, HexBolt, Prism, Tee
+from iwgnet_grasp.parts.families import Bracket, Elbow, Flange, HexBolt, Prism, Tee, TurnedPart
 from iwgnet_grasp.parts.solids import to_trimesh
 
 # Kind in config/parts.yaml -> what its sizes are.
@@ -27,6 +27,9 @@ KINDS = {
     "flanges": Flange,
     "tees": Tee,
     "prisms": Prism,
+    "turned_parts": TurnedPart,
+    "elbows": Elbow,
+    "other_connecting_rods": ConnectingRod,
 }
 LONGEST = 0.17  # m: a slot of the tray (config/cell.yaml) is 0.18 m long
 THINNEST = 0.002  # m: thinner parts drown in the depth camera's noise
