@@ -13,6 +13,7 @@ MAP_SIGMA = 1.0  # px, of cos, sin and width
 # beside a shoulder, where three millimetres decide between a face and an edge under the pads: a
 # grasp counts as what it is worth on average over so much error of its place.
 PLACE_SIGMA = 3.0
+PLACE_DISTANCE = 12  # px, half a pad, of further places on a ridge of the quality
 
 
 def decode_grasps(
@@ -24,7 +25,8 @@ def decode_grasps(
     min_distance_px: int = 6,
     threshold: float = 0.02,
 ) -> list[Grasp]:
-    """Local maxima of the expected quality, best first. All maps float32 [H, W].
+    """Local maxima of the expected quality and, while they are fewer than `max_grasps`, the best
+    places between them; best first. All maps float32 [H, W].
 
     cos 2theta and sin 2theta are smoothed, never the angle, which jumps at +-90 deg. Grasps closer
     than `min_distance_px` to a better one and below `threshold` are left out.
@@ -35,7 +37,9 @@ def decode_grasps(
     width = cv2.GaussianBlur(width, (0, 0), MAP_SIGMA)
     q = expected_quality(q, cos, sin, PLACE_SIGMA)
     grasps = []
-    for y, x in local_maxima(q, min_distance_px, threshold, max_grasps):
+    peaks = local_maxima(q, min_distance_px, threshold, max_grasps)
+    places = peaks + places_between(q, peaks, threshold, max_grasps - len(peaks))
+    for y, x in sorted(places, key=lambda place: -q[place]):
         theta = float(wrap_theta(0.5 * np.arctan2(sin[y, x], cos[y, x])))
         opening = max(float(width[y, x]), 0.0) * WIDTH_REFERENCE_PX
         quality = float(np.clip(q[y, x], 0, 1))
@@ -74,3 +78,29 @@ def local_maxima(
         if all(max(abs(row - r), abs(column - c)) > min_distance for r, c in peaks):
             peaks.append((row, column))
     return peaks
+
+
+def places_between(
+    image: np.ndarray, peaks: list[tuple[int, int]], threshold: float, count: int
+) -> list[tuple[int, int]]:
+    """Up to `count` (row, column) of the highest values above the threshold, PLACE_DISTANCE apart
+    from each other and from the peaks.
+
+    A straight shank is one ridge with a single maximum, which the fingers may have no room at.
+    """
+    left = image.copy()
+
+    def take(row: int, column: int) -> None:
+        top, start = max(row - PLACE_DISTANCE, 0), max(column - PLACE_DISTANCE, 0)
+        left[top : row + PLACE_DISTANCE + 1, start : column + PLACE_DISTANCE + 1] = 0
+
+    for row, column in peaks:
+        take(row, column)
+    places: list[tuple[int, int]] = []
+    while len(places) < count:
+        row, column = divmod(int(left.argmax()), left.shape[1])
+        if left[row, column] <= threshold:
+            break
+        places.append((row, column))
+        take(row, column)
+    return places
