@@ -24,6 +24,7 @@ constexpr double kFarthestCentroid = 0.04;  // m from the grasp point: farther o
 constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
+constexpr double kLengthwise = 0.035;    // m between the pads: a part held by less is not held lengthwise
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
 
 double seconds_since(Clock::time_point start) {
@@ -213,7 +214,7 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
     ends[side] = y;
   }
   const double length = ends[0] + ends[1];
-  held.lengthwise = length < width;
+  held.lengthwise = width > kLengthwise && length < width;
   const double center_y = (T_base_view.inverse() * centroid).y();
   held.offset = held.lengthwise ? 0.0 : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
   // How far it reaches down cannot be seen from above, only that it ends at the table. Turned upright

@@ -134,6 +134,20 @@ TEST(PlanPick, APartHeldLengthwiseLiesAlongTheSlotToo) {
   EXPECT_LT((T_slot.translation() - kCell.tray.slots()[2]).head<2>().norm(), 1e-6);
 }
 
+TEST(PlanPick, APartOfWhichLittleIsSeenLiesAcrossTheSlot) {
+  // 22 mm between the pads and less than that seen across them: a part on its edge, whose ends lie
+  // lower, not one that is held lengthwise.
+  PickAndPlace picker(kCell, kConfig);
+  const PickRequest r = request(0.5, 0.05, 0.022, 0.0, 2);
+  picker.set_heights(heights_of([](double x, double y) {
+    return std::abs(x - 0.5) < 0.011 && std::abs(y - 0.05) < 0.008 ? 0.03 : std::nan("");
+  }));
+  PickPlan plan;
+  const PickResult result = picker.plan_pick(kCell.observe_joints, r, plan);
+  ASSERT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+  EXPECT_NEAR(std::abs(tcp(plan.carry.back().q, r.grasp.width)(0, 0)), 1.0, 1e-6);
+}
+
 TEST(PlanPick, ThePadsStandAtThePartsSidesWhateverTheCentroidSays) {
   // A bar along base y, gripped 25 mm from its middle; a neighbour draws the centroid aside.
   PickAndPlace picker(kCell, kConfig);
