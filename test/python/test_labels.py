@@ -21,7 +21,7 @@ from iwgnet_grasp.data.grasp_rectangle import (
     wrap_theta,
 )
 from iwgnet_grasp.data.labels import label_maps
-from iwgnet_grasp.networks.decode import decode_grasps, local_maxima
+from iwgnet_grasp.networks.decode import PLACE_DISTANCE, decode_grasps, local_maxima
 
 SIZE = 128
 
@@ -186,3 +186,21 @@ def test_peaks_are_sorted_distant_and_above_the_threshold():
     assert local_maxima(image, 2, 0.1, 1) == [(40, 40)]
     plateau = np.ones((20, 20), np.float32)
     assert len(local_maxima(plateau, 30, 0.1, 10)) == 1
+
+
+def test_a_ridge_gives_further_places_that_stay_apart():
+    rows, columns = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
+    along, across = columns - SIZE / 2, rows - SIZE / 2
+    q = (0.8 - 0.002 * np.abs(along)) * np.exp(-((across / 4) ** 2))
+    q = np.where(np.abs(along) < SIZE / 3, q, 0).astype(np.float32)
+    ones = np.ones_like(q)
+    grasps = decode_grasps(q, -ones, 0 * ones, 0.2 * ones, max_grasps=5)
+    assert len(grasps) == 5
+    assert [g.quality for g in grasps] == sorted((g.quality for g in grasps), reverse=True)
+    assert abs(grasps[0].x_px - SIZE / 2) <= 1
+    for i, a in enumerate(grasps):
+        assert abs(a.y_px - SIZE / 2) <= 8
+        for b in grasps[:i]:
+            assert max(abs(a.x_px - b.x_px), abs(a.y_px - b.y_px)) > PLACE_DISTANCE
+    # Where nothing is left above the threshold there are no further ones.
+    assert len(decode_grasps(q, -ones, 0 * ones, 0.2 * ones, max_grasps=50)) < 50
