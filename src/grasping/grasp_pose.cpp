@@ -108,6 +108,13 @@ double tip_height_at(int gap) {
   return table[gap];
 }
 
+// m, how far the tips sink at most when the fingers close on from a gap.
+double sinks_from(int gap) {
+  double lowest = 0.0;
+  for (int i = 0; i < gap; ++i) lowest = std::max(lowest, tip_height_at(i) - tip_height_at(gap));
+  return lowest;
+}
+
 // How high the tips must stand so that both fingers clear what lies beside the grasp's centre, at
 // every gap. A finger meets the highest point over the pad's width and some play.
 class Clearance {
@@ -192,7 +199,8 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
     // Beside a shoulder of the object they may still close to the expected width, and sink.
     const int closed = std::min(contact, expected);
     const double lowest = tip - (tip_height_at(closed) - tip_height_at(contact));
-    if (lowest < floor + config.floor_clearance) continue;
+    // What slides out of wide open fingers lets them close, and sink.
+    if (lowest - sinks_from(closed) < floor + config.floor_clearance) continue;
     int opening = contact;
     while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
     if (opening >= contact + play) return {true, lowest, closed * kStep, opening * kStep, contact * kStep};
