@@ -28,6 +28,7 @@ constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surfa
 constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
 constexpr int kPlaneTrials = 200;
 constexpr double kGoesOn = 0.004;         // m from where a straight upper side would be
+constexpr double kShank = 0.03;           // m, up to this width nothing slides out of the fingers
 constexpr double kSnug = 0.006;           // m, cells of the height map, noise of the network's width
 constexpr double kSideShare = 0.4;        // of the overlap of finger and object, up from the tips: where the
                                           // object's side is measured
@@ -358,6 +359,8 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.shifts = file.get<std::vector<double>>("pose.shifts");
   config.shift_scale = positive("shift_scale");
   config.lever_scale = positive("lever_scale");
+  config.hang_scale = positive("hang_scale");
+  config.width_scale = positive("width_scale");
   config.finger_thickness = positive("finger_thickness");
   if (config.min_engagement > config.insertion_depth)
     file.fail("pose.min_engagement", "must not exceed insertion_depth");
@@ -486,7 +489,9 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
       lower(pose, T_base_view, view, axes, surface, table, config);
     }
     if (pose.feasible) {
-      pose.quality *= alone_share(pose, pose.width, config) * (kTouchless + (1 - kTouchless) * pose.touch);
+      const double wide = std::max(0.0, pose.width - kShank) / config.width_scale;
+      pose.quality *= alone_share(pose, pose.width, config) *
+                      (kTouchless + (1 - kTouchless) * pose.touch) * std::exp(-wide * wide);
       return pose;
     }
     if (first.reason.empty()) first = pose;
@@ -526,9 +531,10 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
   if (!located.pose.reason.empty()) return located.pose;
   const auto with_lever = [&](GraspPose pose) {
     if (!pose.feasible || !centroid) return pose;
-    const Eigen::Vector3d away = *centroid - pose.T_base_tcp.translation();
-    const double lever = away.dot(pose.T_base_tcp.linear().col(1)) / config.lever_scale;
-    pose.quality *= std::exp(-lever * lever);
+    const Eigen::Vector3d away =
+        pose.T_base_tcp.linear().transpose() * (*centroid - pose.T_base_tcp.translation());
+    const double lever = away.y() / config.lever_scale, hang = std::max(0.0, away.z()) / config.hang_scale;
+    pose.quality *= std::exp(-lever * lever - hang * hang);
     return pose;
   };
   const double width = std::min(located.pose.width, config.max_opening);

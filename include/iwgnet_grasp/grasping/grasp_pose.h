@@ -54,7 +54,9 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double spread_scale;       // m that `contact` exceeds the width, likewise
   std::vector<double> shifts;  // m across the closing direction, other places that are tried
   double shift_scale;        // m of such a shift, likewise
-  double lever_scale;        // m from the centroid, likewise
+  double lever_scale;        // m from the centroid along the pads, likewise
+  double hang_scale;         // m of the centroid beyond the pads along the approach, likewise
+  double width_scale;        // m of the width beyond a shank's, likewise
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
   std::vector<Eigen::Vector2d> finger_outline;
@@ -84,7 +86,8 @@ double width_in_metres(double width_px, double depth_m, double fx_px);
 // soon as it leaves the table. The tips go as deep as the insertion depth allows and what lies under
 // their sweep from the opening to the object permits; where a neighbour is close, the opening
 // shrinks. quality is the network's, less what is measured: the angle left between pads and object,
-// what the fingers would take along (alone_share), and pads that touch by their edge only. Never
+// what the fingers would take along (alone_share), pads that touch by their edge only, and how wide
+// the object is: what is round slides out of wide open fingers. Never
 // throws for a bad grasp: feasible is false and reason says why (no depth, outside the workspace,
 // wider than the gripper, fingers collide).
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
@@ -96,8 +99,8 @@ GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camer
 double alone_share(const GraspPose& pose, double width, const GraspPoseConfig& config);
 
 // grasp_pose() at the grasp's place and beside it along the pads, whichever is best: quality also
-// falls with the distance from the network's place and, along the pads, from the object's centroid
-// (base_link) where that is known, each as exp(-(amount / scale)^2).
+// falls with the distance from the network's place and from the object's centroid (base_link) where
+// that is known, along the pads and along the approach, each as exp(-(amount / scale)^2).
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
                              const CellConfig& cell, const GraspPoseConfig& config,
