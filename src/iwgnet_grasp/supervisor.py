@@ -73,7 +73,7 @@ class Settings:
     tray_slots: int = 10
     max_attempts: int = 30
     max_idle_looks: int = 3
-    min_quality: float = 0.30
+    min_quality: float = 0.12
 
     def __post_init__(self) -> None:
         if self.replan not in ("once", "every"):
