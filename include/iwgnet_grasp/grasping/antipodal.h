@@ -16,7 +16,7 @@ namespace iwgnet_grasp::grasping {
 struct AntipodalConfig {      // config/grasping.yaml, section "labels"
   int surface_samples;        // points drawn on a part's surface
   double friction;            // Coulomb, pad on part
-  double grip_force;          // N
+  double grip_force;          // N, the robot's: config/motion.yaml
   double min_width;           // m between the contacts
   double max_tilt;            // rad, of the line between the contacts against the horizontal
   double min_contact_area;    // share of the pad that must touch
@@ -63,10 +63,11 @@ struct GraspLabel {
   GraspPose pose;           // as grasp_pose() gives it for this rectangle
 };
 
-// Executable top-down grasps of every visible part, best first within a part, parts in order.
+// Executable grasps of every visible part, best first within a part, parts in order.
 // depth (CV_32FC1 m, noise-free) and instances (CV_32SC1) show the whole scene from `camera`.
 // quality in (0, 1]: distance of the centre of mass from the line between the contacts, how
-// squarely and how much the pads touch, tilt, and clearance from what lies beside the part.
+// squarely and how much the pads touch, clearance from what lies beside the part, and whether the
+// part is alone between the fingers.
 // Throws Error when the images do not fit the camera.
 std::vector<GraspLabel> label_grasps(const std::vector<ScenePart>& parts, const cv::Mat& depth,
                                      const cv::Mat& instances, const PinholeIntrinsics& camera,

@@ -87,9 +87,9 @@ double width_in_metres(double width_px, double depth_m, double fx_px);
 // their sweep from the opening to the object permits; where a neighbour is close, the opening
 // shrinks. quality is the network's, less what is measured: the angle left between pads and object,
 // what the fingers would take along (alone_share), pads that touch by their edge only, and how wide
-// the object is: what is round slides out of wide open fingers. Never
-// throws for a bad grasp: feasible is false and reason says why (no depth, outside the workspace,
-// wider than the gripper, fingers collide).
+// the object is: what is round slides out of wide open fingers. Never throws for a bad grasp:
+// feasible is false and reason says why (no depth, outside the workspace, wider than the gripper,
+// fingers collide).
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                      const Pose& T_base_camera, const HeightMap& heights,
                      const CellConfig& cell, const GraspPoseConfig& config);

@@ -19,8 +19,9 @@ class HeightMap {
   HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera, const Pose& T_base_camera,
             const CellConfig& cell, double resolution = 0.002, double border = 0.11);
 
-  // The same surface over the xy plane of another frame, `half` (m, along x and y) around its origin, as heights along
-  // its z axis. What lies below a point of the surface is taken for solid. Outside: -infinity.
+  // The same surface over the xy plane of another frame, `half` (m, along x and y) around its
+  // origin, as heights along its z axis. What lies below a point of the surface is taken for solid.
+  // Outside: -infinity.
   HeightMap seen_from(const Pose& T_base_view, const Eigen::Vector2d& half) const;
 
   // m above base_link's z = 0; 0 outside the map.
