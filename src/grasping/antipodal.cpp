@@ -392,7 +392,9 @@ AntipodalConfig load_antipodal_config(const std::string& config_dir) {
   };
   config.surface_samples = static_cast<int>(positive("surface_samples"));
   config.friction = positive("friction");
-  config.grip_force = YamlFile(config_dir + "/motion.yaml").get<double>("grip_force");
+  const YamlFile motion(config_dir + "/motion.yaml");
+  config.grip_force = motion.get<double>("grip_force");
+  if (!(config.grip_force > 0)) motion.fail("grip_force", "must be positive");
   config.min_width = positive("min_width");
   config.max_tilt = positive("max_tilt");
   config.min_contact_area = positive("min_contact_area");

@@ -251,7 +251,7 @@ class SceneMaker:
         crop = self.settings["crop"]
         if np.count_nonzero(seen) < crop["min_pixels"]:
             return None
-        x, y, width, height = cv2.boundingRect(seen.view(np.uint8))
+        x, y, width, height = bounding_box(seen)
         window = seen[y : y + height, x : x + width]
         count, pieces, statistics, _ = cv2.connectedComponentsWithStats(window.astype(np.uint8))
         for i in range(1, count):
