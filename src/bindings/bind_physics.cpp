@@ -48,6 +48,8 @@ class GraspLabeler {
       const int index = static_cast<int>(i);
       parts.push_back({grasps.get(), cell.world().part(index).T_base_part, index});
     }
+    for (const physics::Support& support : cell.world().supports())
+      parts[support.under].load += support.force;
     const CameraConfig& camera = cell.camera();
     return grasping::label_grasps(parts, depth, mask, camera.color, camera.T_base_color,
                                   cell.config(), pose_config_, config_);
@@ -186,6 +188,15 @@ void bind_physics(py::module_& m) {
           },
           "Who touches whom: [(name, name, N, point (3,) m in base_link)]; parts are 'part:INDEX'.")
       .def(
+          "supports",
+          [](SimulatedCell& c) {
+            py::list supports;
+            for (const physics::Support& s : c.world().supports())
+              supports.append(py::make_tuple(s.under, s.over, s.force));
+            return supports;
+          },
+          "Which parts rest on which: [(part below, part above, N)]")
+      .def(
           "ideal_depth",
           [](SimulatedCell& c) { return without_gil<float>(c, &SimulatedCell::ideal_depth); },
           "(H, W) float32 m, colour frame, noise-free")
@@ -195,6 +206,17 @@ void bind_physics(py::module_& m) {
             return without_gil<std::int32_t>(c, &SimulatedCell::part_mask);
           },
           "(H, W) int32, colour frame: index of the part seen, -1 for none")
+      .def(
+          "ideal_view",
+          [](SimulatedCell& c) {
+            std::pair<cv::Mat, cv::Mat> view;
+            {
+              py::gil_scoped_release release;
+              view = c.ideal_view();
+            }
+            return py::make_tuple(to_numpy<float>(view.first), to_numpy<std::int32_t>(view.second));
+          },
+          "ideal_depth() and part_mask() at the price of one")
       .def(
           "part_poses",
           [](SimulatedCell& c) {

@@ -20,7 +20,7 @@ using kinematics::kPadWidth;
 
 constexpr double kGravity = 9.81;        // m/s^2
 constexpr float kPatchDepth = 0.0005f;   // m, a soft pad yields this much: what lies within touches
-constexpr double kCellDistance = 0.003;  // m, candidates closer than this ...
+constexpr double kCellDistance = 0.004;  // m, candidates closer than this ...
 constexpr double kCellAngle = 0.13;      // rad, ... and than this are tried once
 constexpr float kRim = 0.002f;           // m around a pad: a part that bulges there meets its edge
 constexpr float kBulge = 0.0003f;        // m
@@ -63,6 +63,7 @@ struct PosedPart {
   Eigen::Matrix3Xf points, normals;  // base_link
   Eigen::Vector3d com;
   float area_per_point;              // m^2
+  double freedom;                    // share of a grasp's quality that what rests on it leaves
 };
 
 // How two parallel pads touch a part that they squeeze.
@@ -219,6 +220,7 @@ class Labeller {
     posed.normals = T.linear() * model.normals;
     posed.com = part.T_base_part.translation();
     posed.area_per_point = static_cast<float>(model.area / std::max<Eigen::Index>(1, model.points.cols()));
+    posed.freedom = std::exp(-part.load / (model.mass * kGravity * config_.load_scale));
     std::vector<GraspLabel> labels;
     // Farther from the centre of mass than this, quality is below the least in any case.
     const double farthest = config_.com_scale * std::sqrt(-std::log(std::min(config_.min_quality, 1.0)));
@@ -308,7 +310,7 @@ class Labeller {
       if (!touched) return {};
       contact = *touched;
       // What slips or takes a neighbour along does so wherever between the pads it lies.
-      if (i == 0 && quality_of(contact, label.pose, mass, config_, pose_config_) <
+      if (i == 0 && posed.freedom * quality_of(contact, label.pose, mass, config_, pose_config_) <
                         config_.min_quality * kUncentred)
         return {};
       const bool settled = std::abs(contact.center) < kCenterTolerance &&
@@ -327,7 +329,7 @@ class Labeller {
       const auto shifted = squeeze(posed, label.pose, shift);
       beside = std::min(beside, shifted ? quality_of(*shifted, label.pose, mass, config_, pose_config_) : 0.0);
     }
-    const double quality = kNominalShare * exact + (1 - kNominalShare) * beside;
+    const double quality = posed.freedom * (kNominalShare * exact + (1 - kNominalShare) * beside);
     if (quality < config_.min_quality) return {};
     const double scale = label.rectangle.width_px / label.pose.width;  // px per m at the surface
     label.rectangle.quality = label.pose.quality = quality;
@@ -399,6 +401,7 @@ AntipodalConfig load_antipodal_config(const std::string& config_dir) {
   config.max_tilt = positive("max_tilt");
   config.min_contact_area = positive("min_contact_area");
   config.com_scale = positive("com_scale");
+  config.load_scale = positive("load_scale");
   config.min_quality = positive("min_quality");
   config.nms_distance = positive("nms_distance");
   config.nms_angle = positive("nms_angle");

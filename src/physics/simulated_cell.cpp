@@ -495,10 +495,13 @@ cv::Mat SimulatedCell::ideal_depth() {
   return impl_->renderer.depth(impl_->camera.color, impl_->camera.T_base_color);
 }
 
-cv::Mat SimulatedCell::part_mask() {
+cv::Mat SimulatedCell::part_mask() { return ideal_view().second; }
+
+std::pair<cv::Mat, cv::Mat> SimulatedCell::ideal_view() {
   Impl& m = *impl_;
   m.sync();
-  cv::Mat instances = m.renderer.instances(m.camera.color, m.camera.T_base_color);
+  cv::Mat instances;
+  const cv::Mat depth = m.renderer.depth(m.camera.color, m.camera.T_base_color, &instances);
   std::map<int, int> part_of;
   for (std::size_t i = 0; i < m.part_instances.size(); ++i)
     part_of[m.part_instances[i]] = static_cast<int>(i);
@@ -514,7 +517,7 @@ cv::Mat SimulatedCell::part_mask() {
       line[column] = last_part;
     }
   }
-  return instances;
+  return {depth, instances};
 }
 
 std::vector<double> SimulatedCell::unoccluded_areas() {

@@ -7,6 +7,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
+#include <utility>
 
 #include "pieces.h"
 #include "robot_body.h"
@@ -281,6 +283,28 @@ std::vector<Contact> World::contacts() const {
       strongest[k] = most;
       result[k].point = from_bullet(point);
     }
+  }
+  return result;
+}
+
+std::vector<Support> World::supports() const {
+  std::map<std::pair<int, int>, double> forces;  // under, over
+  for (int m = 0; m < impl_->dispatcher->getNumManifolds(); ++m) {
+    const btPersistentManifold& manifold = *impl_->dispatcher->getManifoldByIndexInternal(m);
+    const int a = static_cast<const Tag*>(manifold.getBody0()->getUserPointer())->part;
+    const int b = static_cast<const Tag*>(manifold.getBody1()->getUserPointer())->part;
+    if (a < 0 || b < 0) continue;
+    double lift = 0.0;  // of a by b
+    for (int i = 0; i < manifold.getNumContacts(); ++i) {
+      const btManifoldPoint& p = manifold.getContactPoint(i);
+      lift += p.getAppliedImpulse() * p.m_normalWorldOnB.z() / impl_->config.timestep;
+    }
+    forces[a < b ? std::pair(a, b) : std::pair(b, a)] += a < b ? -lift : lift;
+  }
+  std::vector<Support> result;
+  for (const auto& [pair, force] : forces) {
+    if (force > 0) result.push_back({pair.first, pair.second, force});
+    if (force < 0) result.push_back({pair.second, pair.first, -force});
   }
   return result;
 }

@@ -368,12 +368,15 @@ void Renderer::clear_instances() {
   impl_->new_scene();
 }
 
-cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
+cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                        cv::Mat* instances) {
   require_camera(camera);
   cv::Mat depth(camera.height, camera.width, CV_32FC1);
+  if (instances) instances->create(camera.height, camera.width, CV_32SC1);
   impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
     const float t = packet.hit.ray.tfar[lane];
     depth.ptr<float>(v)[u] = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID ? kNaN : t;
+    if (instances) instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
   });
   return depth;
 }

@@ -4,12 +4,15 @@ import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 
 from iwgnet_grasp import _core
 
 ROOT = Path(__file__).resolve().parents[2]
+PARTS = ROOT / "assets" / "parts"
 CONFIG = str(ROOT / "config")
 
 
@@ -89,6 +92,29 @@ def test_hidden_parts_are_not_seen(cell):
     assert not (cell.part_mask() >= 0).any()
     cell.show_parts(True)
     assert (cell.part_mask() >= 0).any()
+
+
+def test_a_part_on_another_weighs_on_it_and_spoils_the_grasps_below(cell):
+    def best(part):
+        labels = _core.GraspLabeler(CONFIG).label(cell, *cell.ideal_view())
+        return max((label.rectangle.quality for label in labels if label.part == part), default=0)
+
+    cell.load_scene("five_scattered", 1)
+    assert cell.supports() == []
+    free = best(0)
+    poses = cell.part_poses()
+    poses[1] = poses[0]
+    # Across each other, one flat on the other's end.
+    poses[1, :3, :3] = cv2.Rodrigues(np.array([0, 0, math.pi / 2]))[0] @ poses[0, :3, :3]
+    poses[1, 2, 3] += 2 * poses[0, 2, 3]
+    cell.lay_parts(poses)
+    cell.step(round(0.5 / cell.timestep))
+    supports = cell.supports()
+    assert max(supports, key=lambda support: support[2])[:2] == (0, 1)
+    carried = sum(force for _, over, force in supports if over == 1)
+    mass = yaml.safe_load((PARTS / cell.part_names[1] / "part.yaml").read_text())["mass"]
+    assert carried == pytest.approx(mass * 9.81, rel=0.05)
+    assert best(0) < 0.5 * free < best(1)
 
 
 def test_projection_round_trip():

@@ -21,6 +21,7 @@ struct AntipodalConfig {      // config/grasping.yaml, section "labels"
   double max_tilt;            // rad, of the line between the contacts against the horizontal
   double min_contact_area;    // share of the pad that must touch
   double com_scale;           // m, distance from the centre of mass at which quality has fallen to 1/e
+  double load_scale;          // of its own weight, resting on a part, that leaves 1/e of the quality
   double min_quality;         // labels below are left out
   double nms_distance;        // m, two grasps of a part closer than this ...
   double nms_angle;           // rad, ... and than this are one
@@ -53,6 +54,7 @@ struct ScenePart {
   const PartGrasps* grasps;  // not null
   Pose T_base_part = Pose::Identity();
   int instance = -1;         // its value in the instance image
+  double load = 0.0;         // N, what other parts rest on it with
 };
 
 struct GraspLabel {
@@ -66,8 +68,8 @@ struct GraspLabel {
 // Executable grasps of every visible part, best first within a part, parts in order.
 // depth (CV_32FC1 m, noise-free) and instances (CV_32SC1) show the whole scene from `camera`.
 // quality in (0, 1]: distance of the centre of mass from the line between the contacts, how
-// squarely and how much the pads touch, clearance from what lies beside the part, and whether the
-// part is alone between the fingers.
+// squarely and how much the pads touch, clearance from what lies beside the part, whether the part
+// is alone between the fingers, and whether others would come up with it.
 // Throws Error when the images do not fit the camera.
 std::vector<GraspLabel> label_grasps(const std::vector<ScenePart>& parts, const cv::Mat& depth,
                                      const cv::Mat& instances, const PinholeIntrinsics& camera,

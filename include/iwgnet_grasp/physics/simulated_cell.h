@@ -7,6 +7,7 @@
 #include <memory>
 #include <opencv2/core.hpp>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "iwgnet_grasp/motion/pick_and_place.h"
@@ -77,6 +78,7 @@ class SimulatedCell {
   const std::vector<PartModel>& models() const;  // of the scene's parts, by index
   cv::Mat ideal_depth();                  // CV_32FC1 m, colour frame, no noise
   cv::Mat part_mask();                    // CV_32SC1, colour frame: index of the part seen, or -1
+  std::pair<cv::Mat, cv::Mat> ideal_view();  // both, at the price of one
   // Pixels that each part would cover in the colour image with nothing before it (its outline
   // within the image), counted at a quarter of the resolution.
   std::vector<double> unoccluded_areas();

@@ -37,6 +37,12 @@ struct Contact {
   Eigen::Vector3d point;  // m, base_link, of the strongest
 };
 
+// A part that rests on another.
+struct Support {
+  int under, over;  // parts
+  double force;     // N, the vertical part of the contacts' normal forces
+};
+
 struct LinkPose {
   std::string link;
   Pose T_base_link;
@@ -77,6 +83,7 @@ class World {
   int part_count() const;
   PartState part(int index) const;
   std::vector<Contact> contacts() const;
+  std::vector<Support> supports() const;  // of parts by parts; those asleep as they fell asleep
   bool parts_at_rest() const;  // all asleep: below the sleeping thresholds for their time
 
  private:

@@ -44,7 +44,9 @@ class Renderer {
   void clear_instances();  // keeps the meshes
 
   // CV_32FC1, m along the optical axis, NaN where no surface is hit. T_base_camera: optical -> base.
-  cv::Mat depth(const PinholeIntrinsics& camera, const Pose& T_base_camera);
+  // instances, where given, becomes what instances() returns for the same rays.
+  cv::Mat depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                cv::Mat* instances = nullptr);
   // CV_32SC1: instance handle hit by each pixel, -1 for none.
   cv::Mat instances(const PinholeIntrinsics& camera, const Pose& T_base_camera);
   // CV_8UC3 RGB; noise_sigma: sensor noise in 8-bit steps, drawn from `seed`.

@@ -200,7 +200,7 @@ class SceneMaker:
         """Images with and without parts, and the labels."""
         cell = self.cell
         color = cell.color() if self.detector else self.skip_frame()
-        ideal, mask = cell.ideal_depth(), cell.part_mask()
+        ideal, mask = cell.ideal_view()
         stereo = cell.aligned_depth(cell.depth())
         outline_areas = cell.unoccluded_areas()
         labels = self.executable(self.labeler.label(cell, ideal, mask), stereo)
