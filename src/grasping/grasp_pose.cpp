@@ -174,20 +174,21 @@ std::string millimetres(double metres) {
 struct Descent {
   bool found = false;
   // m: tips' height once closed, that gap, gap to approach with, least gap at which both fingers
-  // stand free
-  double tip, closed, opening, contact;
+  // stand free, tips below the surface at that gap
+  double tip, closed, opening, contact, engaged;
 };
 
-// Deepest position of the tips at which both fingers find room. `floor` is the table's height.
+// Deepest position of the tips at which both fingers find room, `deepest` (m) below the surface at
+// most. `floor` is the table's height.
 Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
-                double surface, double width, double floor) {
+                double surface, double width, double floor, double deepest) {
   const auto steps = [](double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); };
   const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
   const int expected = steps(width);
   const Clearance clearance(heights, axes, config, first, widest, floor);
-  for (double engaged = config.insertion_depth; engaged >= config.min_engagement - 1e-9;
+  for (double engaged = deepest; engaged >= config.min_engagement - 1e-9;
        engaged -= kStep) {
     const double tip = surface - engaged;
     const auto clear = [&](int gap, int contact) {
@@ -204,7 +205,8 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
     if (lowest - sinks_from(closed) < floor + config.floor_clearance) continue;
     int opening = contact;
     while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
-    if (opening >= contact + play) return {true, lowest, closed * kStep, opening * kStep, contact * kStep};
+    if (opening >= contact + play)
+      return {true, lowest, closed * kStep, opening * kStep, contact * kStep, engaged};
   }
   return {};
 }
@@ -305,17 +307,30 @@ double contact_share(const HeightMap& heights, const GraspAxes& axes, double sur
 void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
            const GraspAxes& axes, double surface, double floor, const GraspPoseConfig& config) {
   const auto infeasible = [&](std::string reason) { pose.reason = std::move(reason); };
-  const Descent descent = descend(heights, axes, config, surface, pose.width, floor);
-  if (!descent.found) return infeasible("fingers find no room beside the object");
   const double yaw = std::atan2(axes.along.y(), axes.along.x());
-  const double open_tip =
-      descent.tip + finger_tip_height(descent.closed) - finger_tip_height(descent.opening);
-  // The body is lowest over the scene when the fingers have closed and the tool is at its depth;
-  // it does not move between: open tips measure it.
-  for (const GripperBody& body : config.body)
-    if (heights.max_in(axes.center, yaw, body.half) + config.floor_clearance >
-        open_tip + body.above_tips)
+  // m that the body lacks over what lies below it. The tool does not move while the fingers close:
+  // the opening to approach with measures it.
+  const auto lack = [&](const Descent& d) {
+    const double open_tip = d.tip + finger_tip_height(d.closed) - finger_tip_height(d.opening);
+    double most = 0.0;
+    const auto over = [&](const Eigen::Vector2d& half, double underside) {
+      const double highest = heights.max_in(axes.center, yaw, half) + config.floor_clearance;
+      most = std::max(most, highest - underside);
+    };
+    over(config.palm.half, open_tip + finger_tip_height(d.opening) - config.palm.reach);
+    for (const FingerBody& body : config.fingers)
+      over({body.along + body.spread * d.opening, body.across}, open_tip + body.above_tips);
+    return most;
+  };
+  Descent descent = descend(heights, axes, config, surface, pose.width, floor, config.insertion_depth);
+  if (!descent.found) return infeasible("fingers find no room beside the object");
+  // A part beside the object may keep the body up: the fingers then hold less of it.
+  for (double missing = lack(descent); missing > 0; missing = lack(descent)) {
+    const double deepest = descent.engaged - std::max(missing, kStep);
+    descent = descend(heights, axes, config, surface, pose.width, floor, deepest);
+    if (!descent.found)
       return infeasible("the gripper's body would touch what lies beside the object");
+  }
 
   pose.touch = contact_share(heights, axes, surface, descent.tip, descent.opening);
   pose.opening = descent.opening;
@@ -373,14 +388,18 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
     config.finger_outline.emplace_back(corner[0], corner[1]);
     last = corner[0];
   }
-  for (const auto& body : file.node("pose.body")) {
+  for (const auto& body : file.node("pose.finger_bodies")) {
     try {
-      const auto half = body["half"].as<std::vector<double>>();
-      config.body.push_back({{half.at(0), half.at(1)}, body["above_tips"].as<double>()});
+      const auto along = body["along"].as<std::vector<double>>();
+      config.fingers.push_back({along.at(0), along.at(1), body["across"].as<double>(),
+                                body["above_tips"].as<double>()});
     } catch (const std::exception&) {
-      file.fail("pose.body", "needs entries {half: [along, across], above_tips: height}");
+      file.fail("pose.finger_bodies",
+                "needs entries {along: [closed, per opening], across: half, above_tips: height}");
     }
   }
+  config.palm.half = {positive("palm.along"), positive("palm.across")};
+  config.palm.reach = positive("palm.reach");
   return config;
 }
 

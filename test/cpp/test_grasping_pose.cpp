@@ -157,10 +157,30 @@ TEST(GraspPose, LowNeighbourUnderTheFingersLiftsTheTips) {
 TEST(GraspPose, TallNeighbourUnderThePalmIsInfeasible) {
   Bench bench;
   bench.bar(0.5, 0.0, 0.03, 0.03, 0.03);
-  bench.bar(0.535, 0.0, 0.02, 0.03, 0.10);  // across the closing direction, beside the fingers
+  bench.bar(0.535, 0.0, 0.02, 0.03, 0.12);  // across the closing direction, beside the fingers
   const GraspPose pose = bench.pose(bench.rectangle(0.5, 0.0, 0.03, M_PI / 2, 0.03));
   EXPECT_FALSE(pose.feasible);
   EXPECT_NE(pose.reason.find("body"), std::string::npos) << pose.reason;
+}
+
+TEST(GraspPose, NeighbourUnderTheFingersBodyKeepsTheTipsUp) {
+  Bench bench;
+  bench.bar(0.5, 0.0, 0.03, 0.12, 0.03);
+  const GraspRectangle grasp = bench.rectangle(0.5, 0.0, 0.03, 0.0, 0.03);
+  const GraspPose alone = bench.pose(grasp);
+  ASSERT_TRUE(alone.feasible) << alone.reason;
+  constexpr double kHeight = 0.045;
+  bench.bar(0.5 + 0.054, 0.0, 0.008, 0.12, kHeight);  // beside the tips, under what is above them
+  const GraspPose pose = bench.pose(grasp);
+  ASSERT_TRUE(pose.feasible) << pose.reason;
+  EXPECT_LT(pose.engagement, alone.engagement - 0.003);
+  EXPECT_GE(pose.engagement, bench.config.min_engagement - 1e-6);
+  double lowest = 1.0;  // of the fingers' body above the neighbour, with the fingers open
+  const double open_tip = tool_height(pose) - kinematics::finger_tip_height(pose.opening);
+  for (const auto& body : bench.config.fingers)
+    if (body.along + body.spread * pose.opening > 0.050)
+      lowest = std::min(lowest, open_tip + body.above_tips - kHeight);
+  EXPECT_GE(lowest, bench.config.floor_clearance - 1e-3);
 }
 
 TEST(GraspPose, CentreOverABoreUsesTheRimsHeight) {

@@ -34,9 +34,16 @@ struct GraspPose {
   std::string reason;                  // one line, when not feasible
 };
 
-struct GripperBody {             // of the gripper, over a rectangle around the approach axis
-  Eigen::Vector2d half;          // m, along and across the closing direction
+// What of the fingers hangs over a rectangle around the approach axis; it spreads with the opening.
+struct FingerBody {
+  double along, spread;          // m along the closing direction: half extent along + spread * opening
+  double across;                 // m across it, half extent
   double above_tips;             // m, its lowest point above the tips
+};
+
+struct Palm {
+  Eigen::Vector2d half;          // m, along and across the closing direction
+  double reach;                  // m, its lowest point below tool0
 };
 
 struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
@@ -60,7 +67,8 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
   std::vector<Eigen::Vector2d> finger_outline;
-  std::vector<GripperBody> body;
+  std::vector<FingerBody> fingers;
+  Palm palm;
 };
 GraspPoseConfig load_grasp_pose_config(const std::string& config_dir);  // Throws Error.
 
