@@ -202,8 +202,9 @@ TEST(PlanPick, ALeaningGripperMovesAlongItsApproachAndStandsUprightOverTheTray) 
       const auto expect_on_the_line = [&](const Trajectory& trajectory) {
         for (const TrajectoryPoint& p : trajectory) {
           const Eigen::Vector3d away = tcp(p.q, r.grasp.width).translation() - T.translation();
-          if (away.norm() < kConfig.approach_height / 2)
+          if (away.norm() < kConfig.approach_height / 2) {
             EXPECT_LT(away.cross(T.linear().col(2)).norm(), 0.002);
+          }
         }
       };
       expect_on_the_line(plan.approach);

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -180,3 +181,57 @@ def test_meshes_lie_where_the_links_are():
     # The inner finger holds the pad: it ends behind the pad's face and short of its tip.
     low, high = collision("left_inner_finger").bounds
     assert low[1] > -0.0220203 - 0.00635 / 2 and high[2] < 0.03242 + 0.0375 / 2
+
+
+def gripper_surface(finger_joint):
+    """(n, 3) points of the gripper's collision meshes in tool0, and the gap between the pads."""
+    trimesh = pytest.importorskip("trimesh")
+    frames = link_frames({"finger_joint": finger_joint})
+    surface, gap = [], 0.0
+    for link in ROBOT.findall("link"):
+        name = link.get("name")
+        if not name.startswith(("robotiq", "left", "right")):
+            continue
+        for collision in link.findall("collision"):
+            T = np.linalg.inv(frames["tool0"]) @ frames[name]
+            origin = collision.find("origin")
+            if origin is not None:
+                rpy = Rotation.from_euler("xyz", numbers(origin.get("rpy")))
+                T = T @ transform(numbers(origin.get("xyz")), rpy)
+            shape = collision.find("geometry")[0]
+            if shape.tag == "mesh":
+                path = shape.get("filename").removeprefix("package://iwgnet_grasp/")
+                body = trimesh.load(ROOT / path)
+            else:
+                body = trimesh.creation.box(numbers(shape.get("size")))
+            points, _ = trimesh.sample.sample_surface(body.apply_transform(T), 3000, seed=0)
+            surface.append(points)
+            if name == "left_inner_finger_pad":
+                gap = 2 * np.abs(points[:, 0]).min()
+    return np.concatenate(surface), gap
+
+
+@pytest.mark.parametrize("finger_joint", [0.0, 0.2, 0.4, 0.6, 0.7])
+def test_the_gripper_hangs_over_no_more_than_the_grasping_config_says(finger_joint):
+    if not (ROOT / "assets" / "robot").is_dir():
+        pytest.skip("no assets: run scripts/setup")
+    pose = yaml.safe_load((ROOT / "config" / "grasping.yaml").read_text())["pose"]
+    surface, gap = gripper_surface(finger_joint)
+    assert 0.01 < gap < 0.09
+    along, across, z = np.abs(surface[:, 0]), np.abs(surface[:, 1]), surface[:, 2]
+    slack = pose["floor_clearance"]  # m: what the config leaves free in any case
+    above_tips = z.max() - z + slack
+    covered = z <= pose["palm"]["reach"]  # whatever is wider up there is the arm's business
+    for body in pose["finger_bodies"]:
+        half = body["along"][0] + body["along"][1] * gap
+        inside = (along <= half + slack) & (across <= body["across"] + slack)
+        covered |= inside & (above_tips >= body["above_tips"])
+    # The fingers: their outline over the pads' width and some play.
+    outline = np.array([[pose["finger_thickness"], 0.0], *pose["finger_outline"]])
+    outwards = along - gap / 2
+    covered |= (
+        (outwards <= outline[-1, 0] + slack)
+        & (across <= 0.011 + pose["side_clearance"])
+        & (above_tips >= np.interp(outwards, *outline.T))
+    )
+    assert covered.all(), surface[~covered]
