@@ -1,4 +1,5 @@
-"""Decoding prefers a place that forgives an error of a few pixels along the jaws."""
+"""Decoding prefers a place that forgives an error of a few pixels along the jaws, and whose angle is
+clear."""
 
 import numpy as np
 import pytest
@@ -44,3 +45,15 @@ def test_an_even_quality_stays_as_it_is():
     flat = np.full((40, 40), 0.7, np.float32)
     mean = expected_quality(flat, np.ones_like(flat), np.zeros_like(flat), PLACE_SIGMA)
     np.testing.assert_allclose(mean[10:30, 10:30], 0.7, rtol=1e-5)
+
+
+def test_where_two_directions_are_as_likely_their_mean_is_no_grasp():
+    """Half of the pull towards 0 deg and half towards 90 deg: a short vector that points at 45 deg."""
+    q, cos, sin, width, _ = shank(0.0)
+    q, cos, sin, width = (np.hstack([m, m]) for m in (q, cos, sin, width))
+    half = q.shape[1] // 2
+    q[:, half:] *= 1.2
+    cos[:, half:], sin[:, half:] = 0.05, 0.1
+    best = decode_grasps(q, cos, sin, width)[0]
+    assert best.x_px < half
+    assert best.theta_rad == pytest.approx(0.0, abs=1e-3)
