@@ -69,15 +69,21 @@ class CellError(RuntimeError):
 class Settings:
     """config/supervisor.yaml."""
 
-    replan: str = "every"  # once | every
-    tray_slots: int = 10
-    max_attempts: int = 30
-    max_idle_looks: int = 3
-    min_quality: float = 0.12
+    replan: str  # once | every
+    tray_slots: int
+    max_attempts: int
+    max_idle_looks: int
+    min_quality: float
 
     def __post_init__(self) -> None:
         if self.replan not in ("once", "every"):
             raise ValueError(f"replan: '{self.replan}' is not one of once, every")
+        for key in ("tray_slots", "max_attempts", "max_idle_looks"):
+            value = getattr(self, key)
+            if not (isinstance(value, int) and value > 0):
+                raise ValueError(f"{key}: {value!r} is not a whole number above 0")
+        if not isinstance(self.min_quality, int | float):
+            raise ValueError(f"min_quality: {self.min_quality!r} is not a number")
 
 
 def load_settings(config_dir: str | Path, **changes: object) -> Settings:
@@ -88,10 +94,16 @@ def load_settings(config_dir: str | Path, **changes: object) -> Settings:
     except (OSError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: cannot be read: {error}".replace("\n", " ")) from error
     known = set(Settings.__dataclass_fields__)
+    values = {**values, **changes}
     for key in values:
         if key not in known:
             raise ValueError(f"{path}: key '{key}' is unknown (known: {', '.join(sorted(known))})")
-    return Settings(**{**values, **changes})
+    for key in sorted(known - set(values)):
+        raise ValueError(f"{path}: key '{key}' is missing")
+    try:
+        return Settings(**values)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """The supervisor's cycle and trial.json, on a table that exists in this file only."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -8,7 +9,6 @@ from iwgnet_grasp.perception.types import GraspRectangle
 from iwgnet_grasp.supervisor import (
     CellError,
     Outcome,
-    Settings,
     Target,
     clear_table,
     execution_order,
@@ -16,6 +16,7 @@ from iwgnet_grasp.supervisor import (
 )
 from iwgnet_grasp.trials.record import run_trial, summary_line, write_json
 
+CONFIG = Path(__file__).resolve().parents[2] / "config"
 PICK_SECONDS = 8.0
 
 
@@ -94,7 +95,7 @@ def quiet(_line):
 
 def test_every_replan_looks_again_after_each_pick_and_ends_when_nothing_is_seen():
     table = Table([1, 1, 1])
-    cycle = clear_table(table, Settings("every"), quiet)
+    cycle = clear_table(table, load_settings(CONFIG, replan="every"), quiet)
     assert cycle.ended == "cleared"
     assert table.executed == [(0, 0), (1, 1), (2, 2)]
     assert cycle.looks == 4  # the last one finds the table empty
@@ -102,7 +103,7 @@ def test_every_replan_looks_again_after_each_pick_and_ends_when_nothing_is_seen(
 
 def test_once_replan_takes_one_look_and_tries_each_object_once():
     table = Table([1, 2, 1])
-    cycle = clear_table(table, Settings("once"), quiet)
+    cycle = clear_table(table, load_settings(CONFIG, replan="once"), quiet)
     assert cycle.ended == "sequence_done"
     assert cycle.looks == 1
     assert [o for o, _ in table.executed] == [0, 1, 2]
@@ -122,7 +123,7 @@ def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():
 
 def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again():
     table = Table([2, 1])
-    cycle = clear_table(table, Settings("every"), quiet)
+    cycle = clear_table(table, load_settings(CONFIG, replan="every"), quiet)
     assert table.executed == [(0, 0), (0, 0), (1, 1)]
     assert table.failed_seen[0] == []
     assert table.failed_seen[1] == [cycle.attempts[0].target.grasp]
@@ -131,21 +132,21 @@ def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again
 def test_the_cycle_gives_up_when_nothing_is_graspable():
     table = Table([None, None])
     said = []
-    cycle = clear_table(table, Settings("every", max_idle_looks=3), said.append)
+    cycle = clear_table(table, load_settings(CONFIG, replan="every", max_idle_looks=3), said.append)
     assert cycle.ended == "nothing_graspable"
     assert table.looks == 3
     assert len(said) == 2 and all("fingers collide" in line for line in said)
 
 
 def test_attempts_are_bounded():
-    cycle = clear_table(Table([1000]), Settings("every", max_attempts=7), quiet)
+    cycle = clear_table(Table([1000]), load_settings(CONFIG, replan="every", max_attempts=7), quiet)
     assert cycle.ended == "attempts_used_up"
     assert len(cycle.attempts) == 7
 
 
 def test_a_pick_prints_one_line():
     lines = []
-    clear_table(Table([2]), Settings("every"), lines.append)
+    clear_table(Table([2]), load_settings(CONFIG, replan="every"), lines.append)
     assert len(lines) == 2
     assert "failed (missed)" in lines[0] and "picked" in lines[1]
     assert not any("\n" in line for line in lines)
@@ -154,7 +155,7 @@ def test_a_pick_prints_one_line():
 def trial_of(table, out, replan="every"):
     return run_trial(
         table,
-        Settings(replan),
+        load_settings(CONFIG, replan=replan),
         scene="five_scattered",
         seed=3,
         transport="in_process",
@@ -230,9 +231,14 @@ def test_a_json_file_is_replaced_whole_or_not_at_all(tmp_path):
 
 def test_bad_settings_are_named(tmp_path):
     with pytest.raises(ValueError, match="twice"):
-        Settings(replan="twice")
+        load_settings(CONFIG, replan="twice")
+    with pytest.raises(ValueError, match="tray_slots"):
+        load_settings(CONFIG, tray_slots=0)
     (tmp_path / "supervisor.yaml").write_text("max_atempts: 3\n")
     with pytest.raises(ValueError, match="max_atempts"):
+        load_settings(tmp_path)
+    (tmp_path / "supervisor.yaml").write_text("replan: every\n")
+    with pytest.raises(ValueError, match="missing"):
         load_settings(tmp_path)
     with pytest.raises(ValueError, match="cannot be read"):
         load_settings(tmp_path / "nowhere")
