@@ -1,5 +1,4 @@
-"""Decoding prefers a place that forgives an error of a few pixels along the jaws, and whose angle is
-clear."""
+"""Decoding prefers a place that forgives an error of a few pixels and whose angle is clear."""
 
 import numpy as np
 import pytest
@@ -48,7 +47,7 @@ def test_an_even_quality_stays_as_it_is():
 
 
 def test_where_two_directions_are_as_likely_their_mean_is_no_grasp():
-    """Half of the pull towards 0 deg and half towards 90 deg: a short vector that points at 45 deg."""
+    """As much pull towards 0 as towards 90 deg: a short vector, here one that points at 32 deg."""
     q, cos, sin, width, _ = shank(0.0)
     q, cos, sin, width = (np.hstack([m, m]) for m in (q, cos, sin, width))
     half = q.shape[1] // 2

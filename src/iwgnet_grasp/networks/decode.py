@@ -29,9 +29,9 @@ def decode_grasps(
     places between them; best first. All maps float32 [H, W].
 
     cos 2theta and sin 2theta are smoothed, never the angle, which jumps at +-90 deg. Where two
-    directions are as likely (where the arms of a tee meet) a network gives their mean, which is short
-    and points at neither: a grasp's quality counts by the length of (cos, sin). Grasps closer than
-    `min_distance_px` to a better one and below `threshold` are left out.
+    directions are as likely (where the arms of a tee meet) a network gives their mean, which is
+    short and points at neither: a grasp's quality counts by the length of (cos, sin). Grasps closer
+    than `min_distance_px` to a better one and below `threshold` are left out.
     """
     q = q * np.minimum(np.hypot(cos, sin), 1)
     q = cv2.GaussianBlur(q, (0, 0), Q_SIGMA)
