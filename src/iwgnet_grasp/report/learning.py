@@ -20,8 +20,10 @@ from iwgnet_grasp.trials.statistics import wilson_interval
 SUCCESS_PICTURE = "learning_success.png"
 QUALITY_PICTURE = "learning_quality.png"
 _DPI = 110
-# Okabe and Ito 2008
-_COLOURS = "#0072b2 #56b4e9 #009e73 #e69f00 #d55e00 #cc79a7 #000000 #f0e442".split()
+_COLOURS = (  # Okabe and Ito 2008
+    *("#0072b2", "#56b4e9", "#009e73", "#e69f00"),
+    *("#d55e00", "#cc79a7", "#000000", "#f0e442"),
+)
 
 _INTRODUCTION = """\
 ## Learning
