@@ -288,7 +288,7 @@ std::vector<Contact> World::contacts() const {
 }
 
 std::vector<Support> World::supports() const {
-  std::map<std::pair<int, int>, double> forces;  // under, over
+  std::map<std::pair<int, int>, double> forces;  // N, above 0 where the first of the pair carries
   for (int m = 0; m < impl_->dispatcher->getNumManifolds(); ++m) {
     const btPersistentManifold& manifold = *impl_->dispatcher->getManifoldByIndexInternal(m);
     const int a = static_cast<const Tag*>(manifold.getBody0()->getUserPointer())->part;
