@@ -87,6 +87,9 @@ class Trial:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            # As a terminal starts it: a test run in the background of a script ignores SIGINT, and
+            # its children would inherit that.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 
     def wait_for_line(self, pattern: str) -> str:
