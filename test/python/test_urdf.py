@@ -150,6 +150,21 @@ def test_inertias_are_those_of_real_bodies():
         assert a > 0 and a + b >= c * (1 - 1e-3), link.get("name")
 
 
+def collision_body(element):
+    """The trimesh of a <collision>, in its link's frame."""
+    import trimesh
+
+    shape, origin = element.find("geometry")[0], element.find("origin")
+    if shape.tag == "mesh":
+        body = trimesh.load(ROOT / shape.get("filename").removeprefix("package://iwgnet_grasp/"))
+    else:
+        body = trimesh.creation.box(numbers(shape.get("size")))
+    if origin is not None:
+        rpy = Rotation.from_euler("xyz", numbers(origin.get("rpy")))
+        body.apply_transform(transform(numbers(origin.get("xyz")), rpy))
+    return body
+
+
 def test_meshes_lie_where_the_links_are():
     """Every mesh the URDF names exists, in metres; its geometry spans the joint to the next one."""
     trimesh = pytest.importorskip("trimesh")
@@ -163,14 +178,7 @@ def test_meshes_lie_where_the_links_are():
 
     def collision(name):
         link = next(item for item in ROBOT.findall("link") if item.get("name") == name)
-        element = link.find("collision")
-        path = element.find("geometry/mesh").get("filename")
-        body = trimesh.load(ROOT / path.removeprefix("package://iwgnet_grasp/"))
-        origin = element.find("origin")
-        if origin is not None:
-            rpy = Rotation.from_euler("xyz", numbers(origin.get("rpy")))
-            body.apply_transform(transform(numbers(origin.get("xyz")), rpy))
-        return body
+        return collision_body(link.find("collision"))
 
     # Upper arm and forearm reach from their joint along -x to the next one.
     for name, length in (("upper_arm_link", 0.425), ("forearm_link", 0.39225)):
@@ -192,19 +200,10 @@ def gripper_surface(finger_joint):
         name = link.get("name")
         if not name.startswith(("robotiq", "left", "right")):
             continue
+        T = np.linalg.inv(frames["tool0"]) @ frames[name]
         for collision in link.findall("collision"):
-            T = np.linalg.inv(frames["tool0"]) @ frames[name]
-            origin = collision.find("origin")
-            if origin is not None:
-                rpy = Rotation.from_euler("xyz", numbers(origin.get("rpy")))
-                T = T @ transform(numbers(origin.get("xyz")), rpy)
-            shape = collision.find("geometry")[0]
-            if shape.tag == "mesh":
-                path = shape.get("filename").removeprefix("package://iwgnet_grasp/")
-                body = trimesh.load(ROOT / path)
-            else:
-                body = trimesh.creation.box(numbers(shape.get("size")))
-            points, _ = trimesh.sample.sample_surface(body.apply_transform(T), 3000, seed=0)
+            body = collision_body(collision).apply_transform(T)
+            points, _ = trimesh.sample.sample_surface(body, 3000, seed=0)
             surface.append(points)
             if name == "left_inner_finger_pad":
                 gap = 2 * np.abs(points[:, 0]).min()
