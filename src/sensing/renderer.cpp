@@ -135,10 +135,16 @@ struct Packet {
 
 // Rays from the surface points of a packet towards the lamp or into the open.
 struct ShadowPacket {
-  alignas(64) int valid[kLanes];
-  RTCRay16 ray;
+  alignas(64) int valid[kLanes] = {};
+  RTCRay16 ray = {};
 
+  // Without AVX-512 Embree also reads lanes that are not valid; an empty range keeps them out.
+  void skip(int lane) {
+    valid[lane] = 0;
+    ray.tfar[lane] = -kFar;
+  }
   void set(int lane, const Vec3& origin, const Vec3& direction, float range) {
+    valid[lane] = -1;
     ray.org_x[lane] = origin.x;
     ray.org_y[lane] = origin.y;
     ray.org_z[lane] = origin.z;
@@ -420,7 +426,8 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
       packet.aim(frame, camera, u, first);
       rtcIntersect16(packet.valid, impl_->scene, &context, &packet.hit);
       for (int i = 0; i < kLanes; ++i) {
-        lamp.valid[i] = sky.valid[i] = 0;
+        lamp.skip(i);
+        sky.skip(i);
         if (!packet.valid[i]) continue;
         const int x = u + i % kTile, y = first + i / kTile;
         auto& direct_px = direct.ptr<Vec3>(y)[x];
@@ -444,12 +451,10 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
           lighting.shade(surface, printed, instance.R, &direct_px, &ambient_px);
         }
         if (dot(to_lamp, surface.face_normal) > 0.0f) {
-          lamp.valid[i] = -1;
           lamp.set(i, origin, to_lamp, 1.0f);
         } else {
           visibility.ptr<std::uint8_t>(y)[x] &= ~kLit;
         }
-        sky.valid[i] = -1;
         sky.set(i, origin, hemisphere(surface.face_normal, i), kOcclusionRange);
       }
       rtcOccluded16(lamp.valid, impl_->scene, &shadow_context, &lamp.ray);
