@@ -45,7 +45,7 @@ def run_with_ray(
     address: see cluster.connect(). A trial whose worker died is tried once more, on a new one;
     `say` is told.
     Raises ClusterError when there is no such cluster, PoolError when a worker cannot work or a
-    trial kills its workers.
+    trial kills its workers; in the latter case after the trials that were running have ended.
     """
     handlers = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
     ray = connect(address, workers)
@@ -63,8 +63,9 @@ def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
     idle = [actor_class.remote(make_worker) for _ in range(min(workers, len(tasks)))]
     running: dict = {}  # reference -> actor, task
     died: set[Task] = set()
-    while waiting or running:
-        while waiting and idle:
+    fatal = ""
+    while running or (waiting and not fatal):
+        while waiting and idle and not fatal:
             actor, task = idle.pop(), waiting.pop()
             running[actor.run.remote(*task)] = actor, task
         (done,), _ = ray.wait(list(running), num_returns=1)
@@ -73,11 +74,12 @@ def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
             record = ray.get(done)
         except ray.exceptions.RayActorError as error:
             scene, seed = task
-            if task in died:
-                raise PoolError(
+            if task in died or fatal:
+                fatal = fatal or (
                     f"the worker of {scene} seed {seed} died twice ({first_line(error)}); alone: "
                     f"scripts/run_trials --scene {scene} --seed {seed} --trials 1"
-                ) from None
+                )
+                continue
             say(f"a worker died in {scene} seed {seed}; another tries that trial once more")
             died.add(task)
             waiting.append(task)
@@ -87,6 +89,8 @@ def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
         else:
             idle.append(actor)
             yield record
+    if fatal:
+        raise PoolError(fatal)
 
 
 class _Actor:
