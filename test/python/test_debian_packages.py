@@ -1,4 +1,4 @@
-"""What scripts/setup installs is enough for a machine on which nobody installed anything by hand."""
+"""What scripts/setup installs is enough for a machine on which nothing was installed by hand."""
 
 import re
 from pathlib import Path
