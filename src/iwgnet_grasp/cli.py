@@ -25,7 +25,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 train_app = typer.Typer(
-    help="Train a grasp network on a folder of grasp data, or the [b]detector[/b].\n\n"
+    help="Train a grasp network on a folder of grasp data, the [b]detector[/b] or the object "
+    "[b]mask[/b] network.\n\n"
     "Example: iwgnet train --network iwgnet --data data/train --epochs 30",
     invoke_without_command=True,
     rich_markup_mode="rich",
@@ -144,6 +145,14 @@ def train_detector(context: typer.Context) -> None:
     from iwgnet_grasp.training import detector
 
     _forward(context, detector.train_detector, "train detector")
+
+
+@train_app.command("mask", context_settings=_FORWARD)
+def train_mask(context: typer.Context) -> None:
+    """Train the object mask network; options: iwgnet train mask --help."""
+    from iwgnet_grasp.training import mask_training
+
+    _forward(context, mask_training.train_mask, "train mask")
 
 
 @app.command("evaluate")

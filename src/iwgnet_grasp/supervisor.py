@@ -48,11 +48,14 @@ class Cell(Protocol):
     def look(self) -> int:
         """Takes one snapshot with the arm out of view; returns its scene id."""
 
-    def plan(self, scene_id: int, failed: Sequence[GraspRectangle]) -> list[Target]:
+    def plan(
+        self, scene_id: int, failed: Sequence[GraspRectangle], taken: Sequence[int] = ()
+    ) -> list[Target]:
         """Detects, estimates, prioritises and transforms: the objects of a look in the order in
         which they are to be grasped, each with its best feasible grasp that does not repeat one of
         `failed` (priority.yaml says what repeating is). Objects without any such grasp come with
-        feasible=False."""
+        feasible=False. taken: ids of objects of this look that are thought away: the plan is for
+        the table without them, the others lying as they did."""
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:
         """Picks the object and puts it into the tray; the arm ends out of the camera's view."""
@@ -181,18 +184,28 @@ def clear_table(
                 return cycle
             continue
         idle_looks = 0
-        for target in graspable if settings.replan == "once" else graspable[:1]:
+        taken: list[int] = []  # with replan=once, of this look
+        tried: set[int] = set()
+        while graspable:
+            target = graspable[0]
             start = cell.time()
             outcome = cell.execute(target, slot % settings.tray_slots)
             cycle.attempts.append(Attempt(target, outcome, slot, start, cell.time()))
             say(pick_line(len(cycle.attempts), cycle.attempts[-1]))
+            tried.add(target.object_id)
             if outcome.success:
                 slot += 1
+                taken.append(target.object_id)
             else:
                 cycle.failed.append(target.grasp)
             if len(cycle.attempts) >= settings.max_attempts:
                 cycle.ended = "attempts_used_up"
                 return cycle
+            if settings.replan == "every":
+                break
+            targets = cell.plan(scene_id, cycle.failed, taken)
+            left = [t for t in targets if t.object_id not in tried]
+            graspable = execution_order(left, settings.min_quality)
         if settings.replan == "once":
             cycle.ended = "sequence_done"
             return cycle

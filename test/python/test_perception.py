@@ -29,7 +29,9 @@ from iwgnet_grasp.perception.merged_depth import (
     merge,
     metres,
     object_mask,
-    own_pixels,
+    own_share,
+    pixel_owners,
+    taken_away,
 )
 from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, half_turn, select
 from iwgnet_grasp.training.detector import save_detector
@@ -151,26 +153,43 @@ def test_object_pixels_where_the_empty_scene_has_a_hole():
     assert object_mask(scene(), empty, BOX, 0.004).sum() == 0
 
 
-@pytest.mark.parametrize(("x_px", "top"), [(310.0, 0.02), (350.0, 0.045)])
-def test_own_pixels_end_at_a_neighbour_that_the_box_shows(x_px, top):
-    # A bar with a recess of 6 mm along it, 20 mm high, and at its end a higher one.
-    depth = table()
-    depth[210:230, 300:340] = TABLE - 0.02
-    depth[216:224, 305:335] = TABLE - 0.014
-    depth[200:240, 340:360] = TABLE - 0.045
-    mask = object_mask(depth, table(), BOX, 0.004)
-    grasp = GraspRectangle(x_px, 220.0, math.pi / 2, 25.0, 0.5)
-    own = own_pixels(depth, mask, BOX, grasp, 0.008)
-    expected = np.zeros(depth.shape, bool)
-    expected[210:230, 300:340] = top == 0.02
-    expected[200:240, 340:360] = top != 0.02
-    np.testing.assert_array_equal(own, expected[BOX.slices])
+def test_of_objects_that_claim_a_pixel_the_likeliest_has_it_and_none_beyond_its_box():
+    left, right = Box(300, 200, 40, 40), Box(330, 200, 30, 40)
+    windows = [crop_window(scene(), table(), box, 64) for box in (left, right)]
+    logits = np.full((2, 64, 64), -1.0, np.float32)
+    logits[0] = 1.0  # all of its window, which is larger than its box
+    logits[1, :, 5 + 330 - windows[1].x :] = 2.0
+    owners = pixel_owners(logits, windows, (left, right), (480, 640))
+    expected = np.full((480, 640), -1)
+    expected[left.slices] = 0
+    expected[200:240, 335:360] = 1
+    np.testing.assert_array_equal(owners, expected)
 
 
-def test_a_grasp_beside_the_object_has_no_own_pixels():
-    mask = object_mask(scene(), table(), BOX, 0.004)
-    grasp = GraspRectangle(100.0, 100.0, 0.0, 25.0, 0.5)
-    assert not own_pixels(scene(), mask, BOX, grasp, 0.008).any()
+def test_a_grasp_belongs_to_the_object_between_its_jaws():
+    seen = np.zeros((40, 60), bool)
+    seen[:, 10:] = True
+    left, right = seen.copy(), seen.copy()
+    left[:, 30:], right[:, :30] = False, False
+    across = GraspRectangle(330.0, 220.0, 0.0, 20.0, 0.5)  # half on each
+    assert own_share(seen, left, BOX, across) == pytest.approx(0.5, abs=0.05)
+    along = GraspRectangle(345.0, 220.0, math.pi / 2, 25.0, 0.5)
+    assert own_share(seen, left, BOX, along) == 0.0 and own_share(seen, right, BOX, along) == 1.0
+    over_the_edge = GraspRectangle(312.0, 220.0, 0.0, 20.0, 0.5)  # the table says nothing
+    assert own_share(seen, left, BOX, over_the_edge) == 1.0
+    assert own_share(seen, left, BOX, GraspRectangle(100.0, 100.0, 0.0, 25.0, 0.5)) == 0.0
+
+
+def test_where_an_object_was_taken_away_the_empty_scene_is_seen():
+    depth = scene()
+    depth[200:240, 345:360] = TABLE - 0.04  # a neighbour that touches it
+    owners = np.full(depth.shape, -1, np.int16)
+    owners[202:238, 317:345] = 0  # but for its edges
+    owners[200:240, 345:360] = 1
+    left = taken_away(depth, table(), owners, [0])
+    expected = table()
+    expected[200:240, 345:360] = TABLE - 0.04
+    np.testing.assert_array_equal(left, expected)
 
 
 def test_a_part_is_covered_where_something_higher_stands_beside_it():
@@ -272,6 +291,17 @@ class HighestPoint:
         return found
 
 
+class AllOfTheBox:
+    """Masks that claim whole windows."""
+
+    input_px = 208
+    backend = "none"
+
+    def predict(self, heights: np.ndarray, greys: np.ndarray) -> np.ndarray:
+        assert greys.dtype == np.uint8 and heights.shape == greys.shape
+        return np.ones(heights.shape, np.float32)
+
+
 @pytest.fixture
 def config() -> PerceptionConfig:
     return PerceptionConfig.load()
@@ -282,7 +312,8 @@ def color(shape=(480, 640)) -> np.ndarray:
 
 
 def test_a_look_gives_grasps_in_pixels_of_the_full_image(config):
-    perception = Perception(config, KnownBoxes(BOX, Box(10, 10, 40, 40)), HighestPoint())
+    boxes = KnownBoxes(BOX, Box(10, 10, 40, 40))
+    perception = Perception(config, boxes, HighestPoint(), AllOfTheBox())
     look = perception.look(color(), scene(), table())
     first, second = look.objects
     assert (first.object_id, second.object_id) == (0, 1)
@@ -297,8 +328,31 @@ def test_a_look_gives_grasps_in_pixels_of_the_full_image(config):
     assert math.isnan(second.centroid_depth_m)
 
 
+def test_a_look_without_an_object_shows_what_lay_behind_it(config):
+    # A bar that lies across another, whose box shows it.
+    depth = table()
+    depth[210:230, 270:470] = TOP
+    depth[160:280, 320:340] = TABLE - 0.04
+    upper, lower = Box(320, 160, 20, 120), Box(270, 210, 200, 20)
+    perception = Perception(config, KnownBoxes(upper, lower), HighestPoint(), AllOfTheBox())
+    look = perception.look(color(), depth, table())
+    left = perception.without(look, [0])
+    (seen,) = left.objects
+    assert (seen.object_id, seen.box) == (1, lower)
+    assert seen.valid_pixels == look.objects[1].valid_pixels
+    assert seen.grasps[0].quality > look.objects[1].grasps[0].quality  # it is covered no more
+    expected = table()
+    expected[210:230, 270:320] = expected[210:230, 340:470] = TOP
+    strip = left.depth.copy()
+    strip[:, 312:348] = expected[:, 312:348]  # the upper one's edges
+    np.testing.assert_array_equal(strip, expected)
+    assert np.all(left.depth[160:280, 320:340] == np.float32(TABLE))
+    assert perception.without(look, [0, 1]).objects == ()
+
+
 def test_an_empty_table_is_no_error(config):
-    look = Perception(config, KnownBoxes(), HighestPoint()).look(color(), table(), table())
+    perception = Perception(config, KnownBoxes(), HighestPoint(), AllOfTheBox())
+    look = perception.look(color(), table(), table())
     assert look.objects == () and look.windows == ()
 
 
@@ -314,7 +368,7 @@ def test_an_empty_table_is_no_error(config):
     ],
 )
 def test_bad_images_are_refused_by_name(config, change, complaint):
-    perception = Perception(config, KnownBoxes(BOX), HighestPoint())
+    perception = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox())
     images = {"color": color(), "depth": scene(), "empty_depth": table()} | change
     with pytest.raises(PerceptionError, match=complaint) as caught:
         perception.look(**images)

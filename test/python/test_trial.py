@@ -28,7 +28,7 @@ class Table:
         self.clock = 0.0
         self.looks = 0
         self.executed = []
-        self.failed_seen = []
+        self.failed_seen, self.taken_seen = [], []
         self.fatal_pick, self.error = fatal_pick, error
         self.picks = []  # the judge's
 
@@ -36,8 +36,9 @@ class Table:
         self.looks += 1
         return self.looks
 
-    def plan(self, scene_id, failed):
+    def plan(self, scene_id, failed, taken=()):
         self.failed_seen.append(list(failed))
+        self.taken_seen.append(list(taken))
         return [
             Target(
                 scene_id,
@@ -108,6 +109,7 @@ def test_once_replan_takes_one_look_and_tries_each_object_once():
     assert cycle.looks == 1
     assert [o for o, _ in table.executed] == [0, 1, 2]
     assert not cycle.attempts[1].outcome.success
+    assert table.taken_seen == [[], [0], [0], [0, 2]]  # what failed still lies there
 
 
 def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():

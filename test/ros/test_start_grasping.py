@@ -119,15 +119,18 @@ def test_a_whole_trial_clears_the_table_and_leaves_its_results(tmp_path):
     code, text, record = trial.finish()
     assert code == (0 if record["success"] else 1)
     assert record["transport"] == "ros" and record["objects"] == 5
-    assert set(record["backends"]) == {"detector", "grasps"}
+    assert set(record["backends"]) == {"detector", "masks", "grasps"}
     assert record["in_tray"] >= 3, text  # how many is what the trials of docs/ measure
     assert len(record["picks"]) >= 4 and record["error"] == ""
+    assert {pick["look"] for pick in record["picks"]} == {1}
     assert record["sim_time_s"] > record["wall_time_s"] * 0.5
     for name in ("scene", "boxes", "merged_depth", "grasps"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert_all_gone(nodes)
     with rosbag.Bag(str(tmp_path / "trial.bag")) as bag:
         topics = bag.get_type_and_topic_info().topics
+        scenes = [message.seen_in for _, message, _ in bag.read_messages([Topics.SCENE])]
+    assert scenes[0] == 0 and set(scenes[1:]) == {1}  # one look, then what is left of it
     numbered = [Topics.SCENE, Topics.GRASPS, Topics.GRASP_POSE, Topics.GRIPPER_WIDTH]
     numbered += [f"{action}/goal" for action in (Topics.ARM_ACTION, Topics.GRIPPER_ACTION)]
     for topic in (*numbered, Topics.JOINT_STATES, "/tf", "/tf_static"):

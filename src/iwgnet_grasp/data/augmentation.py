@@ -23,19 +23,24 @@ class Augmentation:
         self, height: np.ndarray, rectangles: np.ndarray, size: int, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Height [S, S] float32 and rectangles of a random crop."""
+        affine = self.similarity(height.shape, size, rng)
+        crop = cv2.warpAffine(height, affine, (size, size), flags=cv2.INTER_LINEAR)
+        self.disturb(crop, rng)
+        return crop, transform(rectangles, affine)
+
+    def similarity(self, shape: tuple[int, int], size: int, rng: np.random.Generator) -> np.ndarray:
+        """(2, 3) px of an image of this shape -> px of a random crop [size, size]."""
         angle = rng.uniform(0, 2 * np.pi)
         zoom = np.exp(rng.uniform(-1, 1) * np.log1p(self.zoom))
         linear = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         if rng.random() < 0.5:
             linear = linear @ np.diag([-1, 1])
-        centre = (np.array(height.shape[::-1]) - 1) / 2 + rng.uniform(-1, 1, 2) * self.shift_px
+        centre = (np.array(shape[::-1]) - 1) / 2 + rng.uniform(-1, 1, 2) * self.shift_px
         offset = np.full(2, (size - 1) / 2) - linear @ centre
-        affine = np.hstack([linear, offset[:, None]])
-        crop = cv2.warpAffine(height, affine, (size, size), flags=cv2.INTER_LINEAR)
-        self._disturb(crop, rng)
-        return crop, transform(rectangles, affine)
+        return np.hstack([linear, offset[:, None]])
 
-    def _disturb(self, crop: np.ndarray, rng: np.random.Generator) -> None:
+    def disturb(self, crop: np.ndarray, rng: np.random.Generator) -> None:
+        """Holes, a tilted table and noise, in place."""
         size = crop.shape[0]
         for _ in range(rng.integers(self.holes + 1)):
             w, h = rng.integers(2, self.hole_px + 1, 2)

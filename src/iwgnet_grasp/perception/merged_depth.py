@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
-from iwgnet_grasp.perception.types import Box, GraspRectangle, PerceptionError, Window
+from iwgnet_grasp.perception.types import NOBODY, Box, GraspRectangle, PerceptionError, Window
 
 OUTLINE_PX = 9  # twice the width of the strip around a part that tells what lies on it
-LEAST_SHARE = 0.15  # of a box's pixels, that a part seen in it has
+LINE_PX = 3.0  # half the width of the band between the jaws that tells whose grasp it is
+LINE_SAMPLES = 25  # along it
 
 
 def metres(depth: np.ndarray, name: str = "depth") -> np.ndarray:
@@ -96,30 +99,51 @@ def object_mask(
         return empty - measured > min_height
 
 
-def own_pixels(
-    depth: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangle, step: float
+def pixel_owners(
+    logits: np.ndarray, windows: Sequence[Window], boxes: Sequence[Box], shape: tuple[int, int]
 ) -> np.ndarray:
-    """Of an object's box (object_mask) what belongs to the part at the grasp, bool of mask's shape.
+    """(H, W) int16: index of the object that each pixel shows, NOBODY where none is likely.
 
-    A part's pixels hang together without a step in depth of more than `step` (m) from one to the
-    next: more than its recesses, less than its thickness. None where the grasp has no pixel of the
-    mask, or few hang together.
+    logits: (N, S, S) of each object's window (networks.object_mask). Of objects that claim the same
+    pixel the likeliest has it; none has pixels outside its box.
     """
-    none = np.zeros_like(mask)
-    rows, columns = np.nonzero(mask)
-    if rows.size == 0:
-        return none
-    distances = np.hypot(columns + box.x - grasp.x_px, rows + box.y - grasp.y_px)
-    seed = int(np.argmin(distances))
-    if distances[seed] > grasp.width_px / 2:
-        return none
-    surface = np.where(mask, depth[box.slices], np.float32(0)).astype(np.float32)
-    barred = np.pad((~mask).astype(np.uint8), 1, constant_values=1)
-    fill = 4 | cv2.FLOODFILL_MASK_ONLY | (2 << 8)
-    start = int(columns[seed]), int(rows[seed])
-    cv2.floodFill(surface, barred, start, 0, step, step, fill)
-    own = barred[1:-1, 1:-1] == 2
-    return own if own.sum() > LEAST_SHARE * mask.sum() else none
+    owners = np.full(shape, NOBODY, np.int16)
+    best = np.zeros(shape, np.float32)
+    for i, (logit, window, box) in enumerate(zip(logits, windows, boxes, strict=True)):
+        rows = slice(max(box.y, window.y), min(box.y + box.height, window.y + len(logit)))
+        columns = slice(max(box.x, window.x), min(box.x + box.width, window.x + len(logit)))
+        inside = logit[
+            rows.start - window.y : rows.stop - window.y,
+            columns.start - window.x : columns.stop - window.x,
+        ]
+        more = inside > best[rows, columns]
+        best[rows, columns][more] = inside[more]
+        owners[rows, columns][more] = i
+    return owners
+
+
+def own_share(seen: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangle) -> float:
+    """Share of the pixels between a grasp's jaws that show the object, of those that show any
+    (`seen`: object_mask()); 0 where none does. seen, mask: (box.height, box.width) bool."""
+    along = np.linspace(-0.5, 0.5, LINE_SAMPLES) * grasp.width_px
+    across = np.array([[-LINE_PX], [0.0], [LINE_PX]])
+    c, s = np.cos(grasp.theta_rad), -np.sin(grasp.theta_rad)
+    columns = np.rint(grasp.x_px - box.x + along * c - across * s).astype(int)
+    rows = np.rint(grasp.y_px - box.y + along * s + across * c).astype(int)
+    inside = (rows >= 0) & (rows < box.height) & (columns >= 0) & (columns < box.width)
+    at = rows[inside], columns[inside]
+    return np.count_nonzero(mask[at]) / max(np.count_nonzero(seen[at]), 1)
+
+
+def taken_away(
+    depth: np.ndarray, empty_depth: np.ndarray, owners: np.ndarray, taken: Sequence[int]
+) -> np.ndarray:
+    """The depth with the empty scene's in place of some objects' pixels and of the strip around
+    them that no other object claims: their edges."""
+    gone = np.isin(owners, list(taken))
+    strip = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OUTLINE_PX, OUTLINE_PX))
+    edges = cv2.dilate(gone.astype(np.uint8), strip).astype(bool) & (owners == NOBODY)
+    return np.where(gone | edges, empty_depth, depth)
 
 
 def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) -> float:

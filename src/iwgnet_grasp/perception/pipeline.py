@@ -1,7 +1,8 @@
-"""Detect, merge, estimate, decode: what the perception node does with one look."""
+"""Detect, mask, merge, estimate, decode: what the perception node does with one look."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Sequence
@@ -9,8 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
+from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.letterbox import Region, checked_region
 from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.merged_depth import (
@@ -20,9 +23,12 @@ from iwgnet_grasp.perception.merged_depth import (
     grasp_depth,
     metres,
     object_mask,
-    own_pixels,
+    own_share,
+    pixel_owners,
+    taken_away,
 )
 from iwgnet_grasp.perception.types import (
+    NOBODY,
     Detection,
     GraspRectangle,
     Look,
@@ -33,7 +39,6 @@ from iwgnet_grasp.perception.types import (
 
 PACKAGE = Path(__file__).resolve().parents[3]
 DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
-NOBODY = -1  # the owner of a pixel that hangs together with no object's best grasp
 
 
 class ObjectDetector(Protocol):
@@ -53,6 +58,16 @@ class WindowGrasps(Protocol):
     def predict(self, depth: np.ndarray, empty: np.ndarray) -> list[list[Any]]: ...
 
 
+class WindowMasks(Protocol):
+    """networks.object_mask.MaskEstimator: logits (N, S, S) of "the object's pixel" in windows of
+    S = input_px around the objects, from heights (N, S, S) and greys (N, S, S) uint8."""
+
+    input_px: int
+    backend: str
+
+    def predict(self, heights: np.ndarray, greys: np.ndarray) -> np.ndarray: ...
+
+
 @dataclass(frozen=True)
 class PerceptionConfig:
     """config/perception.yaml."""
@@ -63,11 +78,15 @@ class PerceptionConfig:
     score_threshold: float
     iou_threshold: float
     max_objects: int
+    mask_weights: Path
+    mask_backend: str
     grasp_weights: Path
     grasp_backend: str
     candidates: int
     min_distance_px: float
     min_angle_rad: float
+    min_own_share: float
+    min_pixels: int
     min_height: float
     max_step: float
     covered_scale: float
@@ -89,11 +108,15 @@ class PerceptionConfig:
             score_threshold=float(detector["score_threshold"]),
             iou_threshold=float(detector["iou_threshold"]),
             max_objects=int(detector["max_objects"]),
+            mask_weights=_in_package(text["masks"]["weights"]),
+            mask_backend=str(text["masks"]["backend"]),
             grasp_weights=_in_package(grasps["weights"]),
             grasp_backend=str(grasps["backend"]),
             candidates=int(grasps["candidates"]),
             min_distance_px=float(grasps["min_distance_px"]),
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
+            min_own_share=float(grasps["min_own_share"]),
+            min_pixels=int(pixels["min_pixels"]),
             min_height=float(pixels["min_height"]),
             max_step=float(pixels["max_step"]),
             covered_scale=float(pixels["covered_scale"]),
@@ -102,19 +125,28 @@ class PerceptionConfig:
 
 
 class Perception:
-    """Object detector and grasp network on one look. Stateless between looks."""
+    """Object detector, mask and grasp network on one look. Stateless between looks."""
 
     def __init__(
-        self, config: PerceptionConfig, detector: ObjectDetector, estimator: WindowGrasps
+        self,
+        config: PerceptionConfig,
+        detector: ObjectDetector,
+        estimator: WindowGrasps,
+        masks: WindowMasks,
     ) -> None:
         self.config = config
         self.detector = detector
         self.estimator = estimator
+        self.masks = masks
 
     @property
     def backends(self) -> dict[str, str]:
         """The library that runs each network."""
-        return {"detector": self.detector.backend, "grasps": self.estimator.backend}
+        return {
+            "detector": self.detector.backend,
+            "masks": self.masks.backend,
+            "grasps": self.estimator.backend,
+        }
 
     def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look:
         """All objects of one look with their grasps, in descending order of detection score.
@@ -136,88 +168,118 @@ class Perception:
         checked = time.perf_counter()
         detections = self.detector.detect(color)
         detected = time.perf_counter()
+        owners = self._owners(color, depth, empty_depth, detections)
+        masked = time.perf_counter()
+        numbered = dict(enumerate(detections))
+        seconds = {
+            "check": checked - start,
+            "detect": detected - checked,
+            "mask": masked - detected,
+        }
+        return self._estimate(color, depth, empty_depth, numbered, owners, seconds, strict=False)
+
+    def without(self, look: Look, taken: Sequence[int]) -> Look:
+        """The look as it would be once the objects with these ids had been taken away and nothing
+        else had moved: the empty scene stands where they were seen. Boxes and pixels of the others
+        stay, their grasps are estimated anew. What the taken ones hide is not known.
+        """
+        depth = taken_away(look.depth, look.empty_depth, look.owners, taken)
+        left = {
+            o.object_id: Detection(o.label, o.score, o.box)
+            for o in look.objects
+            if o.object_id not in taken
+        }
+        return self._estimate(
+            look.color, depth, look.empty_depth, left, look.owners, {}, strict=True
+        )
+
+    def _owners(
+        self,
+        color: np.ndarray,
+        depth: np.ndarray,
+        empty_depth: np.ndarray,
+        detections: Sequence[Detection],
+    ) -> np.ndarray:
+        size = self.masks.input_px
+        boxes = [detection.box for detection in detections]
+        windows = [crop_window(depth, empty_depth, box, size) for box in boxes]
+        heights = np.zeros((len(windows), size, size), np.float32)
+        for height, window in zip(heights, windows, strict=True):
+            with contextlib.suppress(ValueError):  # nothing measured: the brightness alone tells
+                height[:] = normalise_depth(window.depth, window.empty)
+        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+        greys = [grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
+        logits = self.masks.predict(heights, np.array(greys, np.uint8).reshape(heights.shape))
+        return pixel_owners(logits, windows, boxes, depth.shape)
+
+    def _estimate(
+        self,
+        color: np.ndarray,
+        depth: np.ndarray,
+        empty_depth: np.ndarray,
+        detections: dict[int, Detection],
+        owners: np.ndarray,
+        seconds: dict[str, float],
+        strict: bool,
+    ) -> Look:
+        """strict: an object without pixels or grasps of its own has no grasps. Else any in its box
+        will do: of whatever part it is, the next look shows what came of it."""
+        start = time.perf_counter()
         size = self.estimator.input_px
-        windows = tuple(crop_window(depth, empty_depth, d.box, size) for d in detections)
+        boxes = [detection.box for detection in detections.values()]
+        windows = tuple(crop_window(depth, empty_depth, box, size) for box in boxes)
         estimates: list[list[Any]] = []
         if windows:
             estimates = self.estimator.predict(
                 np.stack([w.depth for w in windows]), np.stack([w.empty for w in windows])
             )
         estimated = time.perf_counter()
-        objects = self._objects(detections, windows, estimates, depth, empty_depth)
-        end = time.perf_counter()
-        seconds = {
-            "check": checked - start,
-            "detect": detected - checked,
-            "grasp": estimated - detected,
-            "decode": end - estimated,
-            "total": end - start,
-        }
-        return Look(color, depth, empty_depth, objects, windows, seconds)
-
-    def _objects(
-        self,
-        detections: Sequence[Detection],
-        windows: Sequence[Window],
-        estimates: Sequence[Sequence[Any]],
-        depth: np.ndarray,
-        empty_depth: np.ndarray,
-    ) -> tuple[ObjectGrasps, ...]:
-        config = self.config
-        seen = [object_mask(depth, empty_depth, d.box, config.min_height) for d in detections]
-        grasps = [
-            self._grasps(*args, depth)
-            for args in zip(detections, windows, estimates, seen, strict=True)
-        ]
-        # In piles a box shows neighbours, too: what hangs together with another object's best
-        # grasp is that object's.
-        owner = np.full(depth.shape, NOBODY, np.int16)
-        for i, detection in enumerate(detections):
-            if grasps[i]:
-                box, step = detection.box, config.max_step
-                own = own_pixels(depth, seen[i], box, grasps[i][0], step)
-                free = owner[box.slices] == NOBODY
-                owner[box.slices][own & free] = i
-        objects = []
-        for i, detection in enumerate(detections):
-            owned = owner[detection.box.slices]
-            mask = seen[i] & ((owned == i) | (owned == NOBODY))
-            objects.append(self._object(i, detection, mask, grasps[i], depth))
-        return tuple(objects)
-
-    def _grasps(
-        self,
-        detection: Detection,
-        window: Window,
-        estimates: Sequence[Any],
-        seen: np.ndarray,
-        depth: np.ndarray,
-    ) -> list[GraspRectangle]:
-        config = self.config
-        kept = select(
-            [in_image(estimate, window) for estimate in estimates],
-            detection,
-            config.candidates,
-            config.min_distance_px,
-            config.min_angle_rad,
+        objects = tuple(
+            self._object(i, detection, window, grasps, depth, empty_depth, owners, strict)
+            for (i, detection), window, grasps in zip(
+                detections.items(), windows, estimates, strict=True
+            )
         )
-        radius = config.grasp_depth_radius_px
-        return [
-            replace(grasp, depth_m=grasp_depth(depth, seen, detection.box, grasp, radius))
-            for grasp in kept
-        ]
+        end = time.perf_counter()
+        seconds = seconds | {"grasp": estimated - start, "decode": end - estimated}
+        seconds["total"] = sum(seconds.values())
+        return Look(color, depth, empty_depth, objects, windows, owners, seconds)
 
     def _object(
         self,
         object_id: int,
         detection: Detection,
-        mask: np.ndarray,
-        grasps: Sequence[GraspRectangle],
+        window: Window,
+        estimates: Sequence[Any],
         depth: np.ndarray,
+        empty_depth: np.ndarray,
+        owners: np.ndarray,
+        strict: bool,
     ) -> ObjectGrasps:
         config, box = self.config, detection.box
+        seen = object_mask(depth, empty_depth, box, config.min_height)
+        owned = owners[box.slices]
+        mask = seen & (owned == object_id)
+        if np.count_nonzero(mask) < config.min_pixels:  # unlike all that masks were learnt from
+            mask = seen & (owned == NOBODY)
+        proposed = [in_image(estimate, window) for estimate in estimates]
+        least = config.min_own_share
+        if np.count_nonzero(mask) < config.min_pixels:  # a second box of another object
+            mask, own = np.zeros_like(seen) if strict else seen, []
+        else:
+            own = [g for g in proposed if own_share(seen, mask, box, g) >= least]
+        if own or strict:
+            proposed = own
+        kept = select(
+            proposed,
+            detection,
+            config.candidates,
+            config.min_distance_px,
+            config.min_angle_rad,
+        )
         covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
         free = math.exp(-covered * covered)
+        radius = config.grasp_depth_radius_px
         u, v, pixels = centroid(mask, box)
         return ObjectGrasps(
             object_id=object_id,
@@ -228,7 +290,14 @@ class Perception:
             centroid_v_px=v,
             centroid_depth_m=float(np.median(depth[box.slices][mask])) if pixels else math.nan,
             valid_pixels=pixels,
-            grasps=tuple(replace(grasp, quality=grasp.quality * free) for grasp in grasps),
+            grasps=tuple(
+                replace(
+                    grasp,
+                    quality=grasp.quality * free,
+                    depth_m=grasp_depth(depth, mask, box, grasp, radius),
+                )
+                for grasp in kept
+            ),
         )
 
 
@@ -237,6 +306,7 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
     for both networks. Raises PerceptionError."""
     from iwgnet_grasp.networks.backends import BackendError
     from iwgnet_grasp.networks.inference import GraspEstimator
+    from iwgnet_grasp.networks.object_mask import MaskEstimator
     from iwgnet_grasp.networks.weights import WeightsError
     from iwgnet_grasp.perception.detector import Detector
 
@@ -251,9 +321,10 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
     )
     try:
         estimator = GraspEstimator(config.grasp_weights, backend or config.grasp_backend)
+        masks = MaskEstimator(config.mask_weights, backend or config.mask_backend)
     except (WeightsError, BackendError) as error:
         raise PerceptionError(str(error)) from error
-    return Perception(config, detector, estimator)
+    return Perception(config, detector, estimator, masks)
 
 
 def checked_color(color: np.ndarray) -> np.ndarray:

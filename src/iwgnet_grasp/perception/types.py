@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+NOBODY = -1  # the owner of a pixel that shows no object
+
 
 class PerceptionError(ValueError):
     """An input that perception cannot use: one line saying what, where and what to do."""
@@ -115,4 +117,7 @@ class Look:
     empty_depth: np.ndarray  # (H, W) float32 m, NaN invalid
     objects: tuple[ObjectGrasps, ...]
     windows: tuple[Window, ...]
+    # (H, W) int16, id of the object that each pixel shows, NOBODY for none; None where a look has
+    # travelled over the graph
+    owners: np.ndarray | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # wall time of each step

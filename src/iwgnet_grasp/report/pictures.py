@@ -80,9 +80,16 @@ def scene_picture(look: Look, panel_width: int = 800) -> np.ndarray:
 
 
 def boxes_picture(look: Look) -> np.ndarray:
-    """Figure 7: detections with label and score, on the part of the image that holds them."""
+    """Figure 7: detections with label and score, on the part of the image that holds them; where it
+    is known which pixels are whose they are tinted."""
     view = View.around(look)
-    image = view.image(look.color)
+    color = look.color
+    if look.owners is not None:
+        tint = color.copy()
+        for o in look.objects:
+            tint[look.owners == o.object_id] = color_of(o.object_id)
+        color = cv2.addWeighted(color, 0.6, tint, 0.4, 0)
+    image = view.image(color)
     for o in look.objects:
         outline(image, view.points(box_corners(o)), color_of(o.object_id), 2)
     labels = [

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from sensor_msgs.msg import Image
 
 from iwgnet_grasp import msg
 from iwgnet_grasp.perception.types import (
@@ -58,6 +59,13 @@ def image_array(image, name: str) -> np.ndarray:
         pixels = pixels.byteswap()
     shape = (image.height, image.width) + ((channels,) if channels > 1 else ())
     return pixels.reshape(shape)
+
+
+def depth_to_message(depth: np.ndarray, header) -> Image:
+    """(H, W) float32 m, NaN invalid -> sensor_msgs/Image 32FC1."""
+    height, width = depth.shape
+    data = np.ascontiguousarray(depth, "<f4").tobytes()
+    return Image(header, height, width, "32FC1", False, 4 * width, data)
 
 
 def camera_intrinsics(info) -> CameraIntrinsics:

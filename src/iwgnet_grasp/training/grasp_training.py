@@ -161,8 +161,11 @@ class GraspTraining(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def check_checkpoint(path: Path, module: GraspTraining) -> None:
-    """DataError unless `module` can go on from the checkpoint as if it had never stopped."""
+def check_checkpoint(path: Path, module: lightning.LightningModule) -> None:
+    """DataError unless `module` can go on from the checkpoint as if it had never stopped.
+
+    module: with `run`, what both must agree in, and `settings.network`, its name.
+    """
     if not path.is_file():
         raise DataError(f"{path}: no checkpoint to resume from; train without --resume")
     try:
@@ -191,7 +194,7 @@ def check_checkpoint(path: Path, module: GraspTraining) -> None:
         )
 
 
-class _WholeCheckpoints(TorchCheckpointIO):
+class WholeCheckpoints(TorchCheckpointIO):
     """Lightning's own way copies from a temporary folder: a full disk would leave half a file."""
 
     def save_checkpoint(
@@ -322,7 +325,7 @@ def train_grasp_network(
         max_epochs=settings.epochs,
         logger=TensorBoardLogger(folder, name="", version=""),
         callbacks=callbacks,
-        plugins=[_WholeCheckpoints()],
+        plugins=[WholeCheckpoints()],
         enable_progress_bar=progress,
         enable_model_summary=False,
         num_sanity_val_steps=0,

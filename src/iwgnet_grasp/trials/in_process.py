@@ -34,6 +34,8 @@ class Perceives(Protocol):
 
     def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look: ...
 
+    def without(self, look: Look, taken: Sequence[int]) -> Look: ...
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -76,6 +78,7 @@ class InProcessCell:
         self._empty_depth: np.ndarray | None = None
         self._scene_id = 0
         self._frames: tuple[np.ndarray, np.ndarray] | None = None
+        self._seen: Look | None = None  # what perception made of them
         self._poses: dict[tuple[int, int], tuple[Any, np.ndarray]] = {}
 
     def load(self, scene: str, seed: int) -> int:
@@ -100,14 +103,19 @@ class InProcessCell:
     def look(self) -> int:
         self._scene_id += 1
         self._frames = self.simulated.color(), self._depth()
+        self._seen = None
         return self._scene_id
 
-    def plan(self, scene_id: int, failed: Sequence[GraspRectangle]) -> list[Target]:
+    def plan(
+        self, scene_id: int, failed: Sequence[GraspRectangle], taken: Sequence[int] = ()
+    ) -> list[Target]:
         if self._frames is None or self._empty_depth is None or scene_id != self._scene_id:
             raise CellError(f"look {scene_id} is not the newest; call look() before plan()")
         color, depth = self._frames
         try:
-            look = self._perception.look(color, depth, self._empty_depth)
+            if self._seen is None:
+                self._seen = self._perception.look(color, depth, self._empty_depth)
+            look = self._perception.without(self._seen, taken) if taken else self._seen
         except PerceptionError as error:
             raise CellError(str(error)) from None
         camera = self.simulated.config.camera
@@ -117,7 +125,7 @@ class InProcessCell:
         intrinsics = CameraIntrinsics(k.fx, k.fy, k.cx, k.cy)
         seed = self._pick_config.seed, scene_id
         ranking = rank(look.objects, intrinsics, self._priority, failed, seed)
-        heights = self._core.HeightMap(depth, k, camera.T_base_color, self.simulated.config)
+        heights = self._core.HeightMap(look.depth, k, camera.T_base_color, self.simulated.config)
         self._pick_and_place.set_heights(heights)
         self._poses = {}
         targets = [self._target(ranked, intrinsics, camera, heights) for ranked in ranking.objects]
@@ -125,7 +133,7 @@ class InProcessCell:
             Target(scene_id, o.object_id, o.label, o.score, 0.0, None, False, reason)
             for o, reason in ranking.dropped
         ]
-        if self.on_plan is not None:
+        if self.on_plan is not None and not taken:
             self.on_plan(Plan(scene_id, look, ranking, targets))
         return targets
 

@@ -157,8 +157,8 @@ class _Timed:
     def look(self):
         return self._count(self._cell.look)
 
-    def plan(self, scene_id, failed):
-        return self._count(self._cell.plan, scene_id, failed)
+    def plan(self, scene_id, failed, taken=()):
+        return self._count(self._cell.plan, scene_id, failed, taken)
 
     def execute(self, target, tray_slot):
         return self._cell.execute(target, tray_slot)

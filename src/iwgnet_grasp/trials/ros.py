@@ -37,7 +37,15 @@ from iwgnet_grasp.ros.messages import (
     object_from_message,
     ranked_from_message,
 )
-from iwgnet_grasp.srv import Capture, CaptureRequest, Judge, LoadScene, LoadSceneRequest
+from iwgnet_grasp.srv import (
+    Capture,
+    CaptureRequest,
+    Judge,
+    LoadScene,
+    LoadSceneRequest,
+    Without,
+    WithoutRequest,
+)
 from iwgnet_grasp.supervisor import CellError, Outcome, Target
 from iwgnet_grasp.trials.record import Verdict, judged_by
 
@@ -89,6 +97,7 @@ class RosCell:
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="service")
         self._failed = rospy.Publisher(Topics.FAILED_GRASPS, FailedGrasps, queue_size=1, latch=True)
         self._failed_sent: list[GraspRectangle] | None = None
+        self._planned = 0, 0  # ids of the look that was planned for last: ours, the nodes'
         self._subscribers = {
             topic: rospy.Subscriber(
                 topic,
@@ -109,7 +118,7 @@ class RosCell:
 
     def wait_until_ready(self, seconds: float = 300.0) -> None:
         """Waits until every node is up and connected. Raises CellError naming what is missing."""
-        services = [Topics.CAPTURE, Topics.OBSERVE]
+        services = [Topics.CAPTURE, Topics.WITHOUT, Topics.OBSERVE]
         if self._simulated:
             services += [Topics.LOAD_SCENE, Topics.JUDGE]
 
@@ -160,15 +169,25 @@ class RosCell:
     def look(self) -> int:
         return self._capture(empty_scene=False)
 
-    def plan(self, scene_id: int, failed: Sequence[GraspRectangle]) -> list[Target]:
+    def plan(
+        self, scene_id: int, failed: Sequence[GraspRectangle], taken: Sequence[int] = ()
+    ) -> list[Target]:
         failed = list(failed)
         if failed != self._failed_sent:
             self._failed.publish(failed_to_message(failed, rospy.Header(stamp=rospy.Time.now())))
             self._failed_sent = failed
+        if taken:
+            request = WithoutRequest(scene_id=scene_id, taken=list(taken))
+            response = self._call(Topics.WITHOUT, Without, request, 60.0)
+            if not response.success:
+                raise CellError(response.message)
+        # The nodes know the scene that was thought up by an id of its own.
+        self._planned = scene_id, response.scene_id if taken else scene_id
 
         def of_scene(topic: str) -> Any:
             message = self._newest.get(topic)
-            return message if message is not None and message.scene_id == scene_id else None
+            known = message is not None and message.scene_id == self._planned[1]
+            return message if known else None
 
         def complete() -> bool:
             grasps = of_scene(Topics.GRASPS)
@@ -217,7 +236,7 @@ class RosCell:
             Target(scene_id, o.object_id, o.label, o.score, 0.0, None, False, reason)
             for o, reason in ranking.dropped
         ]
-        if self._on_plan is not None:
+        if self._on_plan is not None and not taken:
             self._wait(lambda: of_scene(Topics.SCENE) is not None, 10.0, lambda: "no scene image")
             self._on_plan(self._plan_for_pictures(of_scene(Topics.SCENE), grasps, ranking, targets))
         return targets
@@ -237,11 +256,11 @@ class RosCell:
         return Plan(scene.scene_id, look, ranking, targets)
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:
+        seen, planned = self._planned
+        scene_id = planned if target.scene_id == seen else target.scene_id
         goal = Goal(
             self._pick_place,
-            PickPlaceGoal(
-                scene_id=target.scene_id, object_id=target.object_id, tray_slot=tray_slot
-            ),
+            PickPlaceGoal(scene_id=scene_id, object_id=target.object_id, tray_slot=tray_slot),
             self._notify,
         )
         try:

@@ -1,0 +1,209 @@
+"""`iwgnet train mask`: the network that tells an object's pixels from its neighbours'."""
+
+import logging
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import lightning
+import torch
+import typer
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from rich.progress import Progress
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from iwgnet_grasp.data.augmentation import Augmentation
+from iwgnet_grasp.data.errors import DataError
+from iwgnet_grasp.data.jacquard import find_jacquard
+from iwgnet_grasp.data.mask_dataset import MaskDataset, MaskViews, load_mask_views
+from iwgnet_grasp.files import disk_error
+from iwgnet_grasp.networks import count_parameters
+from iwgnet_grasp.networks.object_mask import INPUT_PX, NAME, ObjectMask, mask_loss
+from iwgnet_grasp.networks.weights import load_state, save_weights, weights_path
+from iwgnet_grasp.training.card import describe_set
+from iwgnet_grasp.training.detector import has_bfloat16
+from iwgnet_grasp.training.grasp_training import WholeCheckpoints, check_checkpoint
+
+
+@dataclass(frozen=True)
+class MaskTrainingSettings:
+    """Everything that decides the result, stored in the card."""
+
+    network: str = NAME
+    epochs: int = 20
+    batch: int = 8
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-4
+    warm_up: float = 0.05  # share of the steps
+    seed: int = 0
+
+
+class MaskTraining(lightning.LightningModule):
+    """AdamW with a one-cycle schedule on mask_loss, validated by the mean IoU of the masks."""
+
+    def __init__(
+        self, settings: MaskTrainingSettings, training: MaskViews, validation: MaskViews
+    ) -> None:
+        super().__init__()
+        self.settings, self.views, self.held_out = settings, training, validation
+        # What a checkpoint must agree in.
+        self.run: dict[str, Any] = asdict(settings) | {"samples": len(training)}
+        self.network = ObjectMask().to(memory_format=torch.channels_last)
+
+    def train_dataloader(self) -> DataLoader:
+        """Made anew each epoch: a function of seed and epoch alone."""
+        seed = (self.settings.seed, self.current_epoch)
+        dataset = MaskDataset(self.views, INPUT_PX, Augmentation(), seed)
+        order = torch.Generator().manual_seed(hash(seed))
+        batch = min(self.settings.batch, len(dataset))
+        return DataLoader(dataset, batch, shuffle=True, drop_last=True, generator=order)
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(MaskDataset(self.held_out, INPUT_PX), self.settings.batch)
+
+    def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+        windows, masks = batch
+        logits = self.network(windows.to(memory_format=torch.channels_last))
+        loss = mask_loss(logits.float(), masks)
+        self.log("train/loss", loss, batch_size=len(masks))
+        return loss
+
+    def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        windows, masks = batch
+        logits = self.network(windows.to(memory_format=torch.channels_last)).float()
+        scores = {"val/loss": mask_loss(logits, masks), "val/iou": iou(logits > 0, masks > 0.5)}
+        self.log_dict(scores, batch_size=len(masks), prog_bar=True)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["run"] = self.run
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        s = self.settings
+        weights = self.parameters()
+        optimizer = torch.optim.AdamW(weights, s.learning_rate, weight_decay=s.weight_decay)
+        steps = max(int(self.trainer.estimated_stepping_batches), 2)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, s.learning_rate, total_steps=steps, pct_start=s.warm_up
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def iou(found: Tensor, truth: Tensor) -> Tensor:
+    """Mean intersection over union of masks [N, H, W] bool; 1 where both are empty."""
+    both = (found & truth).sum((1, 2))
+    either = (found | truth).sum((1, 2))
+    return torch.where(either > 0, both / either.clamp(min=1), 1.0).mean()
+
+
+def train_mask_network(
+    settings: MaskTrainingSettings,
+    data: list[Path],
+    validation_data: Path,
+    out: Path,
+    log_dir: Path,
+    initial: str | None = None,
+    resume: bool = False,
+    threads: int = 0,
+) -> Path:
+    """Writes OUT/object-mask.safetensors and its card after the last epoch; returns the path.
+
+    DataError names data that cannot be used. `resume` goes on from LOG_DIR/object-mask/last.ckpt.
+    KeyboardInterrupt when the user stops it.
+    """
+    for chatty in ("lightning.pytorch", "lightning.fabric", "lightning"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    if threads:
+        torch.set_num_threads(threads)
+    lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    folders = [*data, validation_data]
+    missing = [folder for folder in folders if not folder.is_dir()]
+    if missing:
+        raise DataError(f"{missing[0]}: no such folder; make a set with 'iwgnet dataset'")
+    with Progress(transient=True) as bar:
+        total = sum(len(find_jacquard(folder)) for folder in folders)
+        task = bar.add_task("reading samples", total=total)
+        training = load_mask_views(data, lambda: bar.advance(task))
+        validation = load_mask_views([validation_data], lambda: bar.advance(task))
+    module = MaskTraining(settings, training, validation)
+    if initial and not resume:
+        load_state(module.network, weights_path(initial), NAME)
+    folder = log_dir / NAME
+    last = folder / "last.ckpt"
+    if resume:
+        check_checkpoint(last, module)
+    trainer = lightning.Trainer(
+        precision="bf16-mixed" if has_bfloat16() else "32-true",
+        max_epochs=settings.epochs,
+        logger=lightning.pytorch.loggers.TensorBoardLogger(folder, name="", version=""),
+        callbacks=[
+            ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False),
+            RichProgressBar(leave=True),
+        ],
+        plugins=[WholeCheckpoints()],
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=5,
+        reload_dataloaders_every_n_epochs=1,
+    )
+    try:
+        trainer.fit(module, ckpt_path=last if resume else None, weights_only=True)
+        (scores,) = trainer.validate(module, verbose=False)
+    except SystemExit:  # Lightning's way to end when the user stops it
+        raise KeyboardInterrupt from None
+    except OSError as error:
+        again = "run it again with --resume" if last.is_file() else "run it again"
+        raise DataError(disk_error(error, folder, again)) from None
+    card = {
+        "network": NAME,
+        "parameters": count_parameters(module.network),
+        "input_px": INPUT_PX,
+        "data": {
+            "training": [describe_set(folder) for folder in data],
+            "samples": len(training),
+            "validation": describe_set(validation_data),
+            "validation_samples": len(validation),
+        },
+        "training": asdict(settings) | ({"initial": initial} if initial else {}),
+        "augmentation": asdict(Augmentation()),
+        "validation": {key: round(scores[f"val/{key}"], 4) for key in ("loss", "iou")},
+        "torch": torch.__version__,
+    }
+    return save_weights(module.network, out / f"{NAME}.safetensors", card)
+
+
+def train_mask(
+    data: Annotated[
+        list[Path], typer.Option(help="Folder of 'iwgnet dataset'; give it again for more.")
+    ] = [Path("data/train")],  # noqa: B006
+    validation_data: Annotated[Path, typer.Option(help="Folder to validate on.")] = Path(
+        "data/val"
+    ),
+    epochs: Annotated[int, typer.Option(min=1)] = 20,
+    batch: Annotated[int, typer.Option(min=1)] = 8,
+    learning_rate: Annotated[float, typer.Option(min=1e-7)] = 3e-3,
+    seed: Annotated[int, typer.Option(help="Of weights, order and augmentation.")] = 0,
+    initial: Annotated[
+        str | None, typer.Option(help="Weights to start from: a name in models/ or a path.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the weights and their card.")] = Path(
+        "models"
+    ),
+    log_dir: Annotated[Path, typer.Option(help="TensorBoard logs and checkpoint.")] = Path(
+        "results/training"
+    ),
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads of torch; 0: all.")] = 0,
+) -> None:
+    """Train the object mask network; writes OUT/object-mask.safetensors and its card."""
+    settings = MaskTrainingSettings(
+        epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed
+    )
+    try:
+        weights = train_mask_network(
+            settings, data, validation_data, out, log_dir, initial, resume, threads
+        )
+    except KeyboardInterrupt:
+        typer.echo("stopped; the same command with --resume goes on", err=True)
+        raise typer.Exit(130) from None
+    typer.echo(f"wrote {weights} and {weights.with_suffix('.json')}")
