@@ -40,7 +40,6 @@ class PerceptionNode:
             buff_size=SCENE_BYTES,
             tcp_nodelay=True,
         )
-
         rospy.Service(Topics.WITHOUT, Without, self.on_without)
 
     def on_scene(self, scene: Scene) -> None:

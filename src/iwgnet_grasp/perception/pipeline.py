@@ -303,7 +303,7 @@ class Perception:
 
 def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Perception:
     """Perception with the weights that a config file names. backend: in place of the config's,
-    for both networks. Raises PerceptionError."""
+    for all networks. Raises PerceptionError."""
     from iwgnet_grasp.networks.backends import BackendError
     from iwgnet_grasp.networks.inference import GraspEstimator
     from iwgnet_grasp.networks.object_mask import MaskEstimator

@@ -64,8 +64,8 @@ def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
     running: dict = {}  # reference -> actor, task
     died: set[Task] = set()
     fatal = ""
-    while running or (waiting and not fatal):
-        while waiting and idle and not fatal:
+    while waiting or running:
+        while waiting and idle:
             actor, task = idle.pop(), waiting.pop()
             running[actor.run.remote(*task)] = actor, task
         (done,), _ = ray.wait(list(running), num_returns=1)
@@ -79,6 +79,7 @@ def _from_actors(ray, make_worker, tasks, workers, say) -> Iterator[Record]:
                     f"the worker of {scene} seed {seed} died twice ({first_line(error)}); alone: "
                     f"scripts/run_trials --scene {scene} --seed {seed} --trials 1"
                 )
+                waiting.clear()
                 continue
             say(f"a worker died in {scene} seed {seed}; another tries that trial once more")
             died.add(task)
