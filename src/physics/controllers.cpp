@@ -11,6 +11,7 @@ constexpr double kGapTolerance = 0.001;  // m, commanded gap reached
 constexpr double kStillSpeed = 0.002;    // m/s of the gap
 constexpr double kStallTime = 0.10;      // s still before the goal: stalled
 constexpr double kStartTime = 0.10;      // s after the command before a stall is looked for
+constexpr double kRestTime = 0.05;       // s that an arm goes nowhere: at rest, though it trembles
 
 std::string joint_error(int joint, double error, double tolerance) {
   std::ostringstream text;
@@ -89,6 +90,7 @@ std::string TrajectoryController::start(const motion::Trajectory& trajectory,
   trajectory_ = std::move(accepted);
   tolerances_ = tolerances;
   start_time_ = time;
+  still_since_ = -1.0;
   status_ = TrajectoryStatus::kActive;
   message_.clear();
   return "";
@@ -115,7 +117,13 @@ motion::TrajectoryPoint TrajectoryController::update(double time, const ArmState
   if (t >= end) {
     const JointVector error = desired_.q - arm.q;
     const int j = worst_joint(error, tolerances_.goal);
-    const bool stopped = arm.qd.cwiseAbs().maxCoeff() <= tolerances_.stopped_velocity;
+    const double slow = tolerances_.stopped_velocity;
+    if (still_since_ < 0 || (arm.q - still_q_).cwiseAbs().maxCoeff() > slow * kRestTime) {
+      still_since_ = time;
+      still_q_ = arm.q;
+    }
+    // An elastic grip makes the wrist tremble: its speed then says nothing, its way does.
+    const bool stopped = arm.qd.cwiseAbs().maxCoeff() <= slow || time - still_since_ >= kRestTime;
     if (j < 0 && stopped) {
       status_ = TrajectoryStatus::kSucceeded;
     } else if (tolerances_.goal_time > 0 && t > end + tolerances_.goal_time) {

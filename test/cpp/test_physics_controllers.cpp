@@ -59,6 +59,22 @@ TEST_F(Controller, ChecksNoPathWhereTheToleranceIsNegative) {
   EXPECT_EQ(follow(controller, arm_at(from), error, 1.7), TrajectoryStatus::kGoalViolated);
 }
 
+// An arm that has arrived but is never slow: what tells rest is how far it goes.
+TEST_F(Controller, TremblingIsRestAndCreepingIsNot) {
+  const auto ends = [&](double way, double speed) {
+    EXPECT_EQ(controller.start(ramp(from, to, 0.1), default_tolerances(), 0.0, arm_at(from)), "");
+    for (int i = 0; i <= std::lround(0.9 / kStep); ++i) {
+      ArmState arm = arm_at(controller.desired().q);
+      arm.q[5] += way * (i % 2 ? 1 : -1) + speed * (i * kStep - 0.1);
+      arm.qd[5] = 0.2;
+      controller.update(i * kStep, arm);
+    }
+    return controller.status();
+  };
+  EXPECT_EQ(ends(0.0003, 0.0), TrajectoryStatus::kSucceeded);
+  EXPECT_EQ(ends(0.0, 0.1), TrajectoryStatus::kGoalViolated);
+}
+
 TEST_F(Controller, RefusesBadTrajectories) {
   const auto refusal = [&](const motion::Trajectory& t) {
     return controller.start(t, default_tolerances(), 0.0, arm_at(from));

@@ -49,6 +49,8 @@ class TrajectoryController {
   TrajectoryStatus status_ = TrajectoryStatus::kIdle;
   motion::TrajectoryPoint desired_;
   double start_time_ = 0.0;
+  double still_since_ = -1.0;  // s; since when the arm has been near still_q_ at the end
+  JointVector still_q_ = JointVector::Zero();
   std::string message_;
 };
 
