@@ -155,6 +155,14 @@ def train_mask(context: typer.Context) -> None:
     _forward(context, mask_training.train_mask, "train mask")
 
 
+@train_app.command("outcome", context_settings=_FORWARD)
+def train_outcome(context: typer.Context) -> None:
+    """Train the network that foresees a pick's outcome; options: iwgnet train outcome --help."""
+    from iwgnet_grasp.training import outcome_training
+
+    _forward(context, outcome_training.train_outcome, "train outcome")
+
+
 @app.command("evaluate")
 def evaluate(
     weights: Annotated[
@@ -231,6 +239,14 @@ def dataset(context: typer.Context) -> None:
     from iwgnet_grasp.data import generate
 
     _forward(context, generate.generate, "dataset")
+
+
+@app.command("picks", context_settings=_FORWARD)
+def picks(context: typer.Context) -> None:
+    """Carry out grasps of simulated piles for 'train outcome'; options: iwgnet picks --help."""
+    from iwgnet_grasp.data import pick_outcomes
+
+    _forward(context, pick_outcomes.pick, "picks")
 
 
 @app.command("export")

@@ -56,6 +56,7 @@ class SceneWorker:
         self.kind = kind
         self.package_dir = package_dir
         self._maker = None
+        self._picker = None
 
     def scenes(self, seed: int, pile: int, wanted: list[int]) -> dict[int, dict[str, bytes]]:
         """Number -> files of the wanted scenes of a pile (generate.encode_scene)."""
@@ -79,6 +80,14 @@ class SceneWorker:
         from iwgnet_grasp.trials.held_out_lifts import lift_pile
 
         return lift_pile(self.maker, seed, pile, wanted)
+
+    def picks(self, seed: int, pile: int) -> bytes:
+        """The file of a pile with picks (pick_outcomes.encode_pile)."""
+        from iwgnet_grasp.data.pick_outcomes import Picker, encode_pile
+
+        if self._picker is None:
+            self._picker = Picker(self.maker)
+        return encode_pile(self._picker.pile(seed, pile))
 
     @property
     def maker(self) -> Any:

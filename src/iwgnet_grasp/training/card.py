@@ -40,7 +40,7 @@ def describe_set(folder: Path) -> dict[str, Any]:
 
 def short_generator(made: dict[str, Any]) -> dict[str, Any]:
     """The content of dataset.json without what config/dataset.yaml says already."""
-    short = {k: made[k] for k in ("seed", "scenes", "families", "library") if k in made}
+    short = {k: made[k] for k in ("seed", "scenes", "piles", "families", "library") if k in made}
     if "settings" in made:
         settings = _flat(made["settings"])
         known = _flat(yaml.safe_load(GENERATOR_SETTINGS.read_text()))

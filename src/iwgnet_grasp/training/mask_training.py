@@ -1,6 +1,5 @@
 """`iwgnet train mask`: the network that tells an object's pixels from its neighbours'."""
 
-import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,7 +7,6 @@ from typing import Annotated, Any
 import lightning
 import torch
 import typer
-from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from rich.progress import Progress
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -17,13 +15,11 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.jacquard import find_jacquard
 from iwgnet_grasp.data.mask_dataset import MaskDataset, MaskViews, load_mask_views
-from iwgnet_grasp.files import disk_error
 from iwgnet_grasp.networks import count_parameters
 from iwgnet_grasp.networks.object_mask import INPUT_PX, NAME, ObjectMask, mask_loss
 from iwgnet_grasp.networks.weights import load_state, save_weights, weights_path
 from iwgnet_grasp.training.card import describe_set
-from iwgnet_grasp.training.detector import has_bfloat16
-from iwgnet_grasp.training.grasp_training import WholeCheckpoints, check_checkpoint
+from iwgnet_grasp.training.fitting import fit, one_cycle, prepare
 
 
 @dataclass(frozen=True)
@@ -80,13 +76,7 @@ class MaskTraining(lightning.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         s = self.settings
-        weights = self.parameters()
-        optimizer = torch.optim.AdamW(weights, s.learning_rate, weight_decay=s.weight_decay)
-        steps = max(int(self.trainer.estimated_stepping_batches), 2)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, s.learning_rate, total_steps=steps, pct_start=s.warm_up
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return one_cycle(self, s.learning_rate, s.weight_decay, s.warm_up)
 
 
 def iou(found: Tensor, truth: Tensor) -> Tensor:
@@ -111,11 +101,7 @@ def train_mask_network(
     DataError names data that cannot be used. `resume` goes on from LOG_DIR/object-mask/last.ckpt.
     KeyboardInterrupt when the user stops it.
     """
-    for chatty in ("lightning.pytorch", "lightning.fabric", "lightning"):
-        logging.getLogger(chatty).setLevel(logging.ERROR)
-    if threads:
-        torch.set_num_threads(threads)
-    lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    prepare(settings.seed, threads)
     folders = [*data, validation_data]
     missing = [folder for folder in folders if not folder.is_dir()]
     if missing:
@@ -128,32 +114,7 @@ def train_mask_network(
     module = MaskTraining(settings, training, validation)
     if initial and not resume:
         load_state(module.network, weights_path(initial), NAME)
-    folder = log_dir / NAME
-    last = folder / "last.ckpt"
-    if resume:
-        check_checkpoint(last, module)
-    trainer = lightning.Trainer(
-        precision="bf16-mixed" if has_bfloat16() else "32-true",
-        max_epochs=settings.epochs,
-        logger=lightning.pytorch.loggers.TensorBoardLogger(folder, name="", version=""),
-        callbacks=[
-            ModelCheckpoint(dirpath=folder, filename="last", enable_version_counter=False),
-            RichProgressBar(leave=True),
-        ],
-        plugins=[WholeCheckpoints()],
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        log_every_n_steps=5,
-        reload_dataloaders_every_n_epochs=1,
-    )
-    try:
-        trainer.fit(module, ckpt_path=last if resume else None, weights_only=True)
-        (scores,) = trainer.validate(module, verbose=False)
-    except SystemExit:  # Lightning's way to end when the user stops it
-        raise KeyboardInterrupt from None
-    except OSError as error:
-        again = "run it again with --resume" if last.is_file() else "run it again"
-        raise DataError(disk_error(error, folder, again)) from None
+    scores = fit(module, settings.epochs, log_dir / NAME, resume)
     card = {
         "network": NAME,
         "parameters": count_parameters(module.network),

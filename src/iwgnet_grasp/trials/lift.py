@@ -12,7 +12,7 @@ look and no other candidate. The judge watches until the gripper is about to let
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ class Lift:
     slip_mm: float = 0.0  # of the part between the pads
     slip_deg: float = 0.0
     message: str = ""  # of pick and place, when it failed
+    others_m: float = 0.0  # farthest that any other part was moved
 
     @property
     def lifted(self) -> bool:
@@ -86,9 +87,20 @@ class Lifter:
         camera = self.cell.camera
         return self._core.HeightMap(depth, camera.color, camera.T_base_color, self.cell.config)
 
-    def pose(self, grasp: GraspRectangle, heights: Any) -> Any:
-        """_core.GraspPose of a rectangle in the colour image, as the robot would compute it."""
+    def pose(self, grasp: GraspRectangle, heights: Any, centroid: np.ndarray | None = None) -> Any:
+        """_core.GraspPose of a rectangle in the colour image, as the robot would compute it; with
+        the object's centroid, (3,) m in base_link, the best of those beside it."""
         camera = self.cell.camera
+        if centroid is not None:
+            return self._core.best_grasp_pose(
+                [core_rectangle(self._core, grasp)],
+                camera.color,
+                camera.T_base_color,
+                heights,
+                self.cell.config,
+                self._pose_config,
+                centroid,
+            )
         return self._core.grasp_pose(
             core_rectangle(self._core, grasp),
             camera.color,
@@ -133,9 +145,12 @@ class Lifter:
         else:
             outcome, message = result.reason.name.lower(), result.message
         verdict = json.loads(cell.verdict())
+        moved = np.linalg.norm((cell.part_poses() - poses)[:, :3, 3], axis=1)
         cell.lay_parts(poses)
         self._laid = poses, cell.part_poses()
-        return _lift(outcome, message, verdict, part)
+        lift = _lift(outcome, message, verdict, part)
+        others = np.delete(moved, lift.part) if lift.part >= 0 else moved
+        return replace(lift, others_m=float(others.max(initial=0.0)))
 
     def _scene(self) -> np.ndarray:
         """Poses of the parts; to the bit those of the first lift while nothing else moved them
