@@ -55,6 +55,7 @@ void bind_grasping(py::module_& m) {
       .def_readwrite("opening", &GraspPose::opening, "m, gap to approach with")
       .def_readwrite("quality", &GraspPose::quality)
       .def_readonly("engagement", &GraspPose::engagement, "m, overlap of finger and object")
+      .def_readonly("contact", &GraspPose::contact, "m, least gap at which both fingers stand free")
       .def_readonly("candidate", &GraspPose::candidate, "which of best_grasp_pose()'s grasps it is")
       .def_readwrite("feasible", &GraspPose::feasible)
       .def_readwrite("reason", &GraspPose::reason, "one line, when not feasible");

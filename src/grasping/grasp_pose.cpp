@@ -178,18 +178,34 @@ struct Descent {
   double tip, closed, opening, contact, engaged;
 };
 
-// Deepest position of the tips at which both fingers find room, `deepest` (m) below the surface at
-// most. `floor` is the table's height.
+// Share of the quality that is left when the fingers stand wider than the object: what lies between
+// them is not the object alone. contact: m between them where they are free; rise: of the closing
+// direction, per metre.
+double alone(double contact, double width, double engaged, double rise, const GraspPoseConfig& config) {
+  // What lies below the upper edge of a leaning object is hidden, not necessarily taken.
+  const double roll = std::asin(std::clamp(rise, -1.0, 1.0));
+  const double hidden = 2 * engaged * std::abs(std::tan(roll));
+  const double beside = std::max(0.0, contact - width - hidden - kSnug) / config.spread_scale;
+  return std::exp(-beside * beside);
+}
+
+// Position of the tips at which both fingers find room, `deepest` (m) below the surface at most: as
+// deep as there is room close to the object. `floor` is the table's height; rise as for alone().
 Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
-                double surface, double width, double floor, double deepest) {
+                double surface, double width, double floor, double deepest, double rise) {
   const auto steps = [](double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); };
   const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
   const int expected = steps(width);
   const Clearance clearance(heights, axes, config, first, widest, floor);
+  Descent best;
+  double most = -1.0;
   for (double engaged = deepest; engaged >= config.min_engagement - 1e-9;
        engaged -= kStep) {
+    const double shallow = (config.insertion_depth - engaged) / config.shallow_scale;
+    const double share = std::exp(-shallow * shallow);
+    if (share <= most) break;  // no place beside the object could make up for it
     const double tip = surface - engaged;
     const auto clear = [&](int gap, int contact) {
       return clearance.free(0, tip, contact, gap) && clearance.free(1, tip, contact, gap);
@@ -205,10 +221,14 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
     if (lowest - sinks_from(closed) < floor + config.floor_clearance) continue;
     int opening = contact;
     while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
-    if (opening >= contact + play)
-      return {true, lowest, closed * kStep, opening * kStep, contact * kStep, engaged};
+    if (opening < contact + play) continue;
+    const double worth = share * alone(contact * kStep, width, engaged, rise, config);
+    if (worth > most) {
+      most = worth;
+      best = {true, lowest, closed * kStep, opening * kStep, contact * kStep, engaged};
+    }
   }
-  return {};
+  return best;
 }
 
 // Stages 1 and 2: where the grasp lies in the base frame. pose.reason says why it has no place.
@@ -322,12 +342,16 @@ void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
       over({body.along + body.spread * d.opening, body.across}, open_tip + body.above_tips);
     return most;
   };
-  Descent descent = descend(heights, axes, config, surface, pose.width, floor, config.insertion_depth);
+  const double rise = (T_base_view.linear() * Eigen::Vector3d(axes.along.x(), axes.along.y(), 0.0)).z();
+  const auto down_to = [&](double deepest) {
+    return descend(heights, axes, config, surface, pose.width, floor, deepest, rise);
+  };
+  Descent descent = down_to(config.insertion_depth);
   if (!descent.found) return infeasible("fingers find no room beside the object");
   // A part beside the object may keep the body up: the fingers then hold less of it.
   for (double missing = lack(descent); missing > 0; missing = lack(descent)) {
     const double deepest = descent.engaged - std::max(missing, kStep);
-    descent = descend(heights, axes, config, surface, pose.width, floor, deepest);
+    descent = down_to(deepest);
     if (!descent.found)
       return infeasible("the gripper's body would touch what lies beside the object");
   }
@@ -371,6 +395,7 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.min_tilt = positive("min_tilt");
   config.misalignment_scale = positive("misalignment_scale");
   config.spread_scale = positive("spread_scale");
+  config.shallow_scale = positive("shallow_scale");
   config.shifts = file.get<std::vector<double>>("pose.shifts");
   config.shift_scale = positive("shift_scale");
   config.lever_scale = positive("lever_scale");
@@ -487,10 +512,11 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
                    [](const Lean& a, const Lean& b) { return a.quality > b.quality; });
 
   const Eigen::Vector3d at(located.axes.center.x(), located.axes.center.y(), located.surface);
-  GraspPose first;
+  GraspPose best, first;
   for (const Lean& lean : leans) {
     GraspPose pose = located.pose;
     pose.quality *= lean.quality;
+    if (best.feasible && pose.quality <= best.quality) break;  // nor can those after it be better
     if (lean.roll == 0.0 && lean.pitch == 0.0) {
       lower(pose, Pose::Identity(), heights, located.axes, located.surface, 0.0, config);
     } else {
@@ -511,11 +537,12 @@ GraspPose leaning(const Located& located, const Slope& slope, const HeightMap& h
       const double wide = std::max(0.0, pose.width - kShank) / config.width_scale;
       pose.quality *= alone_share(pose, pose.width, config) *
                       (kTouchless + (1 - kTouchless) * pose.touch) * std::exp(-wide * wide);
-      return pose;
+      if (!best.feasible || pose.quality > best.quality) best = std::move(pose);
+    } else if (first.reason.empty()) {
+      first = std::move(pose);
     }
-    if (first.reason.empty()) first = pose;
   }
-  return first;
+  return best.feasible ? best : first;
 }
 
 Slope slope_of(const Located& located, const HeightMap& heights, const GraspPoseConfig& config) {
@@ -527,11 +554,7 @@ Slope slope_of(const Located& located, const HeightMap& heights, const GraspPose
 }  // namespace
 
 double alone_share(const GraspPose& pose, double width, const GraspPoseConfig& config) {
-  // What lies below the upper edge of a leaning object is hidden, not necessarily taken.
-  const double roll = std::asin(std::clamp(pose.T_base_tcp.linear()(2, 0), -1.0, 1.0));
-  const double hidden = 2 * pose.engagement * std::abs(std::tan(roll));
-  const double beside = std::max(0.0, pose.contact - width - hidden - kSnug) / config.spread_scale;
-  return std::exp(-beside * beside);
+  return alone(pose.contact, width, pose.engagement, pose.T_base_tcp.linear()(2, 0), config);
 }
 
 GraspPose grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,

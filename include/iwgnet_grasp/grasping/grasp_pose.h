@@ -59,6 +59,7 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double min_tilt;           // rad, a surface that slopes less is taken for level
   double misalignment_scale; // rad, between pads and object, at which quality has fallen to 1/e
   double spread_scale;       // m that `contact` exceeds the width, likewise
+  double shallow_scale;      // m above insertion_depth that cost as much in the choice of the depth
   std::vector<double> shifts;  // m across the closing direction, other places that are tried
   double shift_scale;        // m of such a shift, likewise
   double lever_scale;        // m from the centroid along the pads, likewise

@@ -13,7 +13,12 @@ from torch.utils.data import Dataset
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.pick_outcomes import HEIGHT_STEP, UNMEASURED, PickedPile, read_pile
-from iwgnet_grasp.perception.grasp_view import grasp_view, without_gaps
+from iwgnet_grasp.perception.grasp_view import (
+    CHANNELS,
+    VIEW_CELLS,
+    grasp_view,
+    without_gaps,
+)
 from iwgnet_grasp.perception.types import GraspRectangle
 
 log = logging.getLogger(__name__)
@@ -69,18 +74,17 @@ def _views(pile: PickedPile) -> np.ndarray:
         without_gaps(np.where(h == UNMEASURED, np.nan, h * HEIGHT_STEP).astype(np.float32))
         for h in pile.heights
     ]
-    return np.stack(
-        [
-            grasp_view(
-                heights[look],
-                pile.greys[look],
-                pile.owners[look].astype(np.int16),
-                int(object_id),
-                GraspRectangle(*(float(v) for v in grasp)),
-            ).astype(np.float16)
-            for look, object_id, grasp in zip(pile.look, pile.object_id, pile.grasps, strict=True)
-        ]
-    )
+    views = np.empty((len(pile.look), CHANNELS, VIEW_CELLS, VIEW_CELLS), np.float16)
+    picks = zip(pile.look, pile.object_id, pile.grasps, strict=True)
+    for i, (look, object_id, grasp) in enumerate(picks):
+        views[i] = grasp_view(
+            heights[look],
+            pile.greys[look],
+            pile.owners[look].astype(np.int16),
+            int(object_id),
+            GraspRectangle(*(float(v) for v in grasp)),
+        )
+    return views
 
 
 class PickViewDataset(Dataset):

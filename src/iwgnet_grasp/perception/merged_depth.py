@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from iwgnet_grasp.perception.types import NOBODY, Box, GraspRectangle, PerceptionError, Window
+from iwgnet_grasp.perception.types import (
+    NOBODY,
+    Box,
+    Detection,
+    GraspRectangle,
+    PerceptionError,
+    Window,
+)
 
 OUTLINE_PX = 9  # twice the width of the strip around a part that tells what lies on it
 LINE_PX = 3.0  # half the width of the band between the jaws that tells whose grasp it is
@@ -99,6 +106,35 @@ def object_mask(
         return empty - measured > min_height
 
 
+def distinct_objects(
+    logits: np.ndarray,
+    windows: Sequence[Window],
+    detections: Sequence[Detection],
+    seen: np.ndarray,
+    sure_score: float,
+    min_new_share: float,
+    min_new_pixels: int,
+) -> list[int]:
+    """Indices of the detections that show an object of their own, in the order given (best first).
+
+    Of the pixels that a detection's mask claims at least min_new_share must be claimed by none
+    before it, or it is another box of theirs; one below sure_score must claim min_new_pixels new
+    ones: it counts for what no other explains. logits: (N, S, S) as for pixel_owners(); seen:
+    (H, W) bool, where anything stands on the table.
+    """
+    claimed = np.zeros(seen.shape, bool)
+    distinct = []
+    for i, (logit, window, detection) in enumerate(zip(logits, windows, detections, strict=True)):
+        region, inside = _in_box(logit, window, detection.box)
+        own = (inside > 0) & seen[region]
+        new = np.count_nonzero(own & ~claimed[region])
+        enough = detection.score >= sure_score or new >= min_new_pixels
+        if enough and new >= min_new_share * np.count_nonzero(own):
+            distinct.append(i)
+            claimed[region] |= own
+    return distinct
+
+
 def pixel_owners(
     logits: np.ndarray, windows: Sequence[Window], boxes: Sequence[Box], shape: tuple[int, int]
 ) -> np.ndarray:
@@ -110,16 +146,22 @@ def pixel_owners(
     owners = np.full(shape, NOBODY, np.int16)
     best = np.zeros(shape, np.float32)
     for i, (logit, window, box) in enumerate(zip(logits, windows, boxes, strict=True)):
-        rows = slice(max(box.y, window.y), min(box.y + box.height, window.y + len(logit)))
-        columns = slice(max(box.x, window.x), min(box.x + box.width, window.x + len(logit)))
-        inside = logit[
-            rows.start - window.y : rows.stop - window.y,
-            columns.start - window.x : columns.stop - window.x,
-        ]
-        more = inside > best[rows, columns]
-        best[rows, columns][more] = inside[more]
-        owners[rows, columns][more] = i
+        region, inside = _in_box(logit, window, box)
+        more = inside > best[region]
+        best[region][more] = inside[more]
+        owners[region][more] = i
     return owners
+
+
+def _in_box(logit: np.ndarray, window: Window, box: Box) -> tuple[tuple[slice, slice], np.ndarray]:
+    """The part of the image that a window and its object's box share, and the logits there."""
+    rows = slice(max(box.y, window.y), min(box.y + box.height, window.y + len(logit)))
+    columns = slice(max(box.x, window.x), min(box.x + box.width, window.x + len(logit)))
+    inside = logit[
+        rows.start - window.y : rows.stop - window.y,
+        columns.start - window.x : columns.stop - window.x,
+    ]
+    return (rows, columns), inside
 
 
 def own_share(seen: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangle) -> float:

@@ -16,10 +16,12 @@ import numpy as np
 from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.letterbox import Region, checked_region
 from iwgnet_grasp.files import read_config
+from iwgnet_grasp.perception.grasp_view import grasp_view, without_gaps
 from iwgnet_grasp.perception.merged_depth import (
     centroid,
     covered_share,
     crop_window,
+    distinct_objects,
     grasp_depth,
     metres,
     object_mask,
@@ -68,6 +70,15 @@ class WindowMasks(Protocol):
     def predict(self, heights: np.ndarray, greys: np.ndarray) -> np.ndarray: ...
 
 
+class GraspOutcomes(Protocol):
+    """networks.pick_outcome.OutcomeEstimator: probabilities (N, 2) that a grasp takes its part,
+    alone and without a fault, and that no other part moves, from views (N, C, S, S) float32."""
+
+    backend: str
+
+    def predict(self, views: np.ndarray) -> np.ndarray: ...
+
+
 @dataclass(frozen=True)
 class PerceptionConfig:
     """config/perception.yaml."""
@@ -80,8 +91,13 @@ class PerceptionConfig:
     max_objects: int
     mask_weights: Path
     mask_backend: str
+    sure_score: float
+    min_new_share: float
+    min_new_pixels: int
     grasp_weights: Path
     grasp_backend: str
+    outcome_weights: Path
+    outcome_backend: str
     candidates: int
     min_distance_px: float
     min_angle_rad: float
@@ -99,7 +115,8 @@ class PerceptionConfig:
 
     @staticmethod
     def _of(text: dict) -> PerceptionConfig:
-        detector, grasps, pixels = text["detector"], text["grasps"], text["object_pixels"]
+        detector, masks = text["detector"], text["masks"]
+        grasps, pixels = text["grasps"], text["object_pixels"]
         region = detector["region"]
         return PerceptionConfig(
             detector_weights=_in_package(detector["weights"]),
@@ -108,10 +125,15 @@ class PerceptionConfig:
             score_threshold=float(detector["score_threshold"]),
             iou_threshold=float(detector["iou_threshold"]),
             max_objects=int(detector["max_objects"]),
-            mask_weights=_in_package(text["masks"]["weights"]),
-            mask_backend=str(text["masks"]["backend"]),
+            mask_weights=_in_package(masks["weights"]),
+            mask_backend=str(masks["backend"]),
+            sure_score=float(masks["sure_score"]),
+            min_new_share=float(masks["min_new_share"]),
+            min_new_pixels=int(masks["min_new_pixels"]),
             grasp_weights=_in_package(grasps["weights"]),
             grasp_backend=str(grasps["backend"]),
+            outcome_weights=_in_package(text["outcomes"]["weights"]),
+            outcome_backend=str(text["outcomes"]["backend"]),
             candidates=int(grasps["candidates"]),
             min_distance_px=float(grasps["min_distance_px"]),
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
@@ -125,7 +147,7 @@ class PerceptionConfig:
 
 
 class Perception:
-    """Object detector, mask and grasp network on one look. Stateless between looks."""
+    """All networks on one look. Stateless between looks."""
 
     def __init__(
         self,
@@ -133,11 +155,13 @@ class Perception:
         detector: ObjectDetector,
         estimator: WindowGrasps,
         masks: WindowMasks,
+        outcomes: GraspOutcomes,
     ) -> None:
         self.config = config
         self.detector = detector
         self.estimator = estimator
         self.masks = masks
+        self.outcomes = outcomes
 
     @property
     def backends(self) -> dict[str, str]:
@@ -146,6 +170,7 @@ class Perception:
             "detector": self.detector.backend,
             "masks": self.masks.backend,
             "grasps": self.estimator.backend,
+            "outcomes": self.outcomes.backend,
         }
 
     def look(self, color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> Look:
@@ -168,7 +193,7 @@ class Perception:
         checked = time.perf_counter()
         detections = self.detector.detect(color)
         detected = time.perf_counter()
-        owners = self._owners(color, depth, empty_depth, detections)
+        detections, owners = self._distinct(color, depth, empty_depth, detections)
         masked = time.perf_counter()
         numbered = dict(enumerate(detections))
         seconds = {
@@ -189,17 +214,18 @@ class Perception:
             for o in look.objects
             if o.object_id not in taken
         }
-        return self._estimate(
-            look.color, depth, look.empty_depth, left, look.owners, {}, strict=True
-        )
+        owners = np.where(np.isin(look.owners, list(taken)), NOBODY, look.owners)
+        return self._estimate(look.color, depth, look.empty_depth, left, owners, {}, strict=True)
 
-    def _owners(
+    def _distinct(
         self,
         color: np.ndarray,
         depth: np.ndarray,
         empty_depth: np.ndarray,
         detections: Sequence[Detection],
-    ) -> np.ndarray:
+    ) -> tuple[list[Detection], np.ndarray]:
+        """The detections that show an object of their own, and whose pixel each is."""
+        config = self.config
         size = self.masks.input_px
         boxes = [detection.box for detection in detections]
         windows = [crop_window(depth, empty_depth, box, size) for box in boxes]
@@ -210,7 +236,22 @@ class Perception:
         grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         greys = [grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
         logits = self.masks.predict(heights, np.array(greys, np.uint8).reshape(heights.shape))
-        return pixel_owners(logits, windows, boxes, depth.shape)
+        with np.errstate(invalid="ignore"):
+            seen = empty_depth - depth > config.min_height
+        kept = distinct_objects(
+            logits,
+            windows,
+            detections,
+            seen,
+            config.sure_score,
+            config.min_new_share,
+            config.min_new_pixels,
+        )
+        detections = [detections[i] for i in kept]
+        owners = pixel_owners(
+            logits[kept], [windows[i] for i in kept], [d.box for d in detections], depth.shape
+        )
+        return detections, owners
 
     def _estimate(
         self,
@@ -240,10 +281,40 @@ class Perception:
                 detections.items(), windows, estimates, strict=True
             )
         )
+        decoded = time.perf_counter()
+        objects = self._foreseen(objects, color, depth, empty_depth, owners)
         end = time.perf_counter()
-        seconds = seconds | {"grasp": estimated - start, "decode": end - estimated}
+        seconds = seconds | {
+            "grasp": estimated - start,
+            "decode": decoded - estimated,
+            "foresee": end - decoded,
+        }
         seconds["total"] = sum(seconds.values())
         return Look(color, depth, empty_depth, objects, windows, owners, seconds)
+
+    def _foreseen(
+        self,
+        objects: tuple[ObjectGrasps, ...],
+        color: np.ndarray,
+        depth: np.ndarray,
+        empty_depth: np.ndarray,
+        owners: np.ndarray,
+    ) -> tuple[ObjectGrasps, ...]:
+        """The objects with their grasps' quality times the probability that they succeed."""
+        heights = without_gaps(empty_depth - depth)
+        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+        pairs = [(o, grasp) for o in objects for grasp in o.grasps]
+        if not pairs:
+            return objects
+        views = [grasp_view(heights, grey, owners, o.object_id, grasp) for o, grasp in pairs]
+        outcomes = self.outcomes.predict(np.stack(views))
+        grasps: dict[int, list[GraspRectangle]] = {o.object_id: [] for o in objects}
+        for (o, grasp), (_, still) in zip(pairs, outcomes, strict=True):
+            grasps[o.object_id].append(replace(grasp, quality=grasp.quality * float(still)))
+        return tuple(
+            replace(o, grasps=tuple(sorted(grasps[o.object_id], key=lambda g: -g.quality)))
+            for o in objects
+        )
 
     def _object(
         self,
@@ -307,6 +378,7 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
     from iwgnet_grasp.networks.backends import BackendError
     from iwgnet_grasp.networks.inference import GraspEstimator
     from iwgnet_grasp.networks.object_mask import MaskEstimator
+    from iwgnet_grasp.networks.pick_outcome import OutcomeEstimator
     from iwgnet_grasp.networks.weights import WeightsError
     from iwgnet_grasp.perception.detector import Detector
 
@@ -322,9 +394,10 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
     try:
         estimator = GraspEstimator(config.grasp_weights, backend or config.grasp_backend)
         masks = MaskEstimator(config.mask_weights, backend or config.mask_backend)
+        outcomes = OutcomeEstimator(config.outcome_weights, backend or config.outcome_backend)
     except (WeightsError, BackendError) as error:
         raise PerceptionError(str(error)) from error
-    return Perception(config, detector, estimator, masks)
+    return Perception(config, detector, estimator, masks, outcomes)
 
 
 def checked_color(color: np.ndarray) -> np.ndarray:
