@@ -25,6 +25,7 @@ from iwgnet_grasp.perception.merged_depth import (
     centroid,
     covered_share,
     crop_window,
+    distinct_objects,
     grasp_depth,
     merge,
     metres,
@@ -34,6 +35,7 @@ from iwgnet_grasp.perception.merged_depth import (
     taken_away,
 )
 from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, half_turn, select
+from iwgnet_grasp.perception.types import Window
 from iwgnet_grasp.training.detector import save_detector
 
 TABLE = 0.6  # m
@@ -303,12 +305,12 @@ class AllOfTheBox:
 
 
 class AsGood:
-    """Outcomes: the share of a view that shows no other object, within 20 px of the grasp."""
+    """Outcomes: the share of a view that shows no other object, within 40 px of the grasp."""
 
     backend = "none"
 
     def predict(self, views: np.ndarray) -> np.ndarray:
-        near = views[:, 3, 38:58, 38:58]
+        near = views[:, 3, 28:68, 28:68]
         return np.repeat(1 - near.mean((1, 2))[:, None], 2, axis=1)
 
 
@@ -336,6 +338,40 @@ def test_a_look_gives_grasps_in_pixels_of_the_full_image(config):
     assert grasp.depth_m == pytest.approx(TOP)
     assert second.valid_pixels == 0 and second.grasps == ()
     assert math.isnan(second.centroid_depth_m)
+
+
+def test_a_box_counts_when_its_mask_shows_what_no_better_one_does():
+    seen = np.zeros((100, 200), bool)
+    seen[40:60, 20:180] = True
+    windows = [Window(0, 0, None, None)] * 4
+    logits = np.full((4, 100, 100), -1.0, np.float32)
+    logits[0, 40:60, 20:60] = 1  # 800 px
+    logits[1, 40:60, 20:70] = 1  # 200 of 1000 are new: another box of the first
+    logits[2, 30:60, 50:90] = 1  # 600 of 800 that stand on the table
+    logits[3, 40:60, 85:96] = 1  # 120 of 220
+
+    def kept(score, pixels):
+        boxes = [Box(0, 0, 100, 100)] * 3 + [Box(0, 0, 96, 100)]
+        found = [
+            Detection("rod", s, box) for s, box in zip((0.9, 0.8, 0.7, score), boxes, strict=True)
+        ]
+        return distinct_objects(logits, windows, found, seen, 0.4, 0.35, pixels)
+
+    assert kept(0.5, 200) == [0, 2, 3]
+    assert kept(0.3, 200) == [0, 2]  # doubtful, and too little new
+    assert kept(0.3, 100) == [0, 2, 3]
+
+
+def test_a_grasp_counts_for_less_where_its_outcome_looks_bad(config):
+    depth = scene()
+    depth[200:240, 350:400] = TOP  # another object beside it
+    beside = Box(350, 200, 50, 40)
+    alone = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood())
+    crowded = Perception(config, KnownBoxes(BOX, beside), HighestPoint(), AllOfTheBox(), AsGood())
+    (first,) = alone.look(color(), scene(), table()).objects
+    second = crowded.look(color(), depth, table()).objects[0]
+    assert first.grasps[0].quality == pytest.approx(0.7)
+    assert second.grasps[0].quality < 0.95 * first.grasps[0].quality
 
 
 def test_a_look_without_an_object_shows_what_lay_behind_it(config):
