@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iwgnet_grasp.data.grasp_rectangle import Grasp
+from iwgnet_grasp.data.letterbox import WHOLE
 from iwgnet_grasp.networks.yolov5s import YOLOv5s
 from iwgnet_grasp.perception import (
     Box,
@@ -273,6 +274,8 @@ def test_candidates_lie_in_the_box_and_are_limited():
 class KnownBoxes:
     """A detector that knows where the objects are."""
 
+    region = WHOLE
+
     def __init__(self, *boxes: Box) -> None:
         self.boxes = boxes
 
@@ -360,6 +363,22 @@ def test_a_box_counts_when_its_mask_shows_what_no_better_one_does():
     assert kept(0.5, 200) == [0, 2, 3]
     assert kept(0.3, 200) == [0, 2]  # doubtful, and too little new
     assert kept(0.3, 100) == [0, 2, 3]
+
+
+def test_what_stands_there_without_a_box_is_an_object(config):
+    depth = scene()
+    depth[300:330, 100:200] = TOP  # 3000 px
+    depth[400:420, 100:150] = TOP  # 1000 px
+    perception = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood())
+    look = perception.look(color(), depth, table())
+    known, found = look.objects
+    assert known.box == BOX and found.box == Box(100, 300, 100, 30)
+    assert (found.object_id, found.label, found.score) == (1, "connecting_rod", 0.0)
+    assert found.valid_pixels == 3000 and len(found.grasps) == 1
+    elsewhere = KnownBoxes(BOX)
+    elsewhere.region = (0.4, 0.0, 1.0, 1.0)  # the detector does not look there: a tray, say
+    perception = Perception(config, elsewhere, HighestPoint(), AllOfTheBox(), AsGood())
+    assert len(perception.look(color(), depth, table()).objects) == 1
 
 
 def test_a_grasp_counts_for_less_where_its_outcome_looks_bad(config):

@@ -17,6 +17,7 @@ from iwgnet_grasp.perception.types import (
 )
 
 OUTLINE_PX = 9  # twice the width of the strip around a part that tells what lies on it
+EDGE_PX = 5  # what is narrower is the edge of an object whose mask ends a little inside it
 LINE_PX = 3.0  # half the width of the band between the jaws that tells whose grasp it is
 LINE_SAMPLES = 25  # along it
 
@@ -151,6 +152,22 @@ def pixel_owners(
         best[region][more] = inside[more]
         owners[region][more] = i
     return owners
+
+
+def unexplained_surfaces(
+    seen: np.ndarray, owners: np.ndarray, min_pixels: int
+) -> list[tuple[Box, np.ndarray]]:
+    """What stands on the table and no object owns, in connected pieces of at least min_pixels: the
+    box of each and its pixels in it, (box.height, box.width) bool."""
+    left = (seen & (owners == NOBODY)).astype(np.uint8)
+    left = cv2.morphologyEx(left, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+    _, pieces, statistics, _ = cv2.connectedComponentsWithStats(left)
+    found = []
+    for i, (x, y, width, height, pixels) in enumerate(statistics.tolist()):
+        if i and pixels >= min_pixels:  # 0 is the background
+            box = Box(x, y, width, height)
+            found.append((box, pieces[box.slices] == i))
+    return found
 
 
 def _in_box(logit: np.ndarray, window: Window, box: Box) -> tuple[tuple[slice, slice], np.ndarray]:

@@ -28,6 +28,7 @@ from iwgnet_grasp.perception.merged_depth import (
     own_share,
     pixel_owners,
     taken_away,
+    unexplained_surfaces,
 )
 from iwgnet_grasp.perception.types import (
     NOBODY,
@@ -40,6 +41,7 @@ from iwgnet_grasp.perception.types import (
 )
 
 PACKAGE = Path(__file__).resolve().parents[3]
+UNKNOWN = "unknown"  # label of an object where nothing was detected
 DEFAULT_CONFIG = PACKAGE / "config" / "perception.yaml"
 
 
@@ -47,6 +49,7 @@ class ObjectDetector(Protocol):
     """perception.detector.Detector."""
 
     backend: str
+    region: Region  # of the image, where it looks
 
     def detect(self, color: np.ndarray) -> list[Detection]: ...
 
@@ -94,6 +97,7 @@ class PerceptionConfig:
     sure_score: float
     min_new_share: float
     min_new_pixels: int
+    min_unexplained_pixels: int
     grasp_weights: Path
     grasp_backend: str
     outcome_weights: Path
@@ -130,6 +134,7 @@ class PerceptionConfig:
             sure_score=float(masks["sure_score"]),
             min_new_share=float(masks["min_new_share"]),
             min_new_pixels=int(masks["min_new_pixels"]),
+            min_unexplained_pixels=int(masks["min_unexplained_pixels"]),
             grasp_weights=_in_package(grasps["weights"]),
             grasp_backend=str(grasps["backend"]),
             outcome_weights=_in_package(text["outcomes"]["weights"]),
@@ -224,7 +229,8 @@ class Perception:
         empty_depth: np.ndarray,
         detections: Sequence[Detection],
     ) -> tuple[list[Detection], np.ndarray]:
-        """The detections that show an object of their own, and whose pixel each is."""
+        """The detections that show an object of their own, with a score of 0 what stands there and
+        no detection explains, and whose pixel each is."""
         config = self.config
         size = self.masks.input_px
         boxes = [detection.box for detection in detections]
@@ -237,7 +243,7 @@ class Perception:
         greys = [grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
         logits = self.masks.predict(heights, np.array(greys, np.uint8).reshape(heights.shape))
         with np.errstate(invalid="ignore"):
-            seen = empty_depth - depth > config.min_height
+            seen = without_gaps(empty_depth - depth) > config.min_height
         kept = distinct_objects(
             logits,
             windows,
@@ -251,6 +257,14 @@ class Perception:
         owners = pixel_owners(
             logits[kept], [windows[i] for i in kept], [d.box for d in detections], depth.shape
         )
+        x1, x2 = (round(depth.shape[1] * part) for part in self.detector.region[::2])
+        y1, y2 = (round(depth.shape[0] * part) for part in self.detector.region[1::2])
+        looked_at = np.zeros_like(seen)
+        looked_at[y1:y2, x1:x2] = seen[y1:y2, x1:x2]
+        label = detections[0].label if detections else UNKNOWN
+        for box, surface in unexplained_surfaces(looked_at, owners, config.min_unexplained_pixels):
+            owners[box.slices][surface] = len(detections)
+            detections.append(Detection(label, 0.0, box))
         return detections, owners
 
     def _estimate(
