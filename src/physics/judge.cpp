@@ -79,6 +79,7 @@ struct Judge::Impl {
   bool started = false;
   double goal = 0.0;                     // commanded gap before this step
   double miss_since = -1.0, lost_since = -1.0;
+  double near_since = -1.0, near_gap = 0.0;  // s, m: since when the gap has been near a value
   std::vector<double> touched_since;     // both pads on a part since; -1: not
   PickVerdict pick;                      // the one under way
   Pose T_tcp_part = Pose::Identity();    // at the grip
@@ -179,7 +180,13 @@ void Judge::observe(const World& world, double commanded_gap) {
     if (limit > 0 && c.normal_force > limit) m.note_collision(c, time);
   }
 
-  const bool still = std::abs(gripper.speed) < l.still_speed;
+  // By the way of the gap where its speed trembles on an elastic grip.
+  if (m.near_since < 0 || std::abs(gripper.gap - m.near_gap) > l.still_speed * l.firm_time) {
+    m.near_since = time;
+    m.near_gap = gripper.gap;
+  }
+  const bool still =
+      std::abs(gripper.speed) < l.still_speed || time - m.near_since >= l.firm_time;
   const bool squeezing = gripper.force >= l.firm_force && still && commanded_gap < gripper.gap;
   int firm = -1;
   for (int p = 0; p < parts; ++p) {
