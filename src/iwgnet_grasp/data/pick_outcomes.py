@@ -45,8 +45,8 @@ OTHER_SHARE = 0.5  # of the objects get a second pick, with any of their executa
 MARGIN_PX = 140  # kept around all boxes: what a grasp at their edge is surrounded by
 DESCRIPTION = "picks.json"
 HEIGHT_STEP = 1e-4  # m
+CARRIED = 0.10  # m that another part moves at least when it was taken along
 UNMEASURED = np.int16(-(2**15))
-_FRESH_ATTEMPTS = 5  # with other draws, when a pile cannot be built
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,6 @@ class PickedPile:
     meant: np.ndarray  # (n,) index of the part that the object's pixels show, -1: none
     part: np.ndarray  # (n,) that was held, -1: none
     others_m: np.ndarray  # (n,) farthest that another part was moved
-
-
-CARRIED = 0.10  # m that another part moves at least when it was taken along
 
 
 class Picker:
@@ -112,9 +109,9 @@ class Picker:
         return _as_arrays(looks, picked)
 
     def _build(self, seed: int, pile: int) -> tuple[np.random.Generator, int]:
-        from iwgnet_grasp.data.generate import pile_rng
+        from iwgnet_grasp.data.generate import PILE_ATTEMPTS, pile_rng
 
-        for attempt in range(_FRESH_ATTEMPTS):
+        for attempt in range(PILE_ATTEMPTS):
             rng = pile_rng(seed, pile, attempt)
             spec = self._maker.spec(rng)
             spec.arrangement = self._maker.core.Arrangement.STACKED

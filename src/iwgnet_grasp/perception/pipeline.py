@@ -1,4 +1,4 @@
-"""Detect, mask, merge, estimate, decode: what the perception node does with one look."""
+"""Detect, mask, merge, estimate, decode, foresee: what the perception node does with one look."""
 
 from __future__ import annotations
 
@@ -314,7 +314,8 @@ class Perception:
         empty_depth: np.ndarray,
         owners: np.ndarray,
     ) -> tuple[ObjectGrasps, ...]:
-        """The objects with their grasps' quality times the probability that they succeed."""
+        """The objects with their grasps' quality times the probability that no other part
+        moves; best first."""
         heights = without_gaps(empty_depth - depth)
         grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         pairs = [(o, grasp) for o in objects for grasp in o.grasps]
