@@ -29,7 +29,7 @@ import yaml
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.files import disk_error, write_whole
-from iwgnet_grasp.perception.types import Box
+from iwgnet_grasp.perception.types import Box, CameraIntrinsics
 from iwgnet_grasp.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -172,7 +172,8 @@ class Picker:
         if not math.isfinite(z):
             return None
         k, T = camera.color, camera.T_base_color
-        point = [(o.centroid_u_px - k.cx) * z / k.fx, (o.centroid_v_px - k.cy) * z / k.fy, z]
+        intrinsics = CameraIntrinsics(k.fx, k.fy, k.cx, k.cy)
+        point = intrinsics.deproject(o.centroid_u_px, o.centroid_v_px, z)
         return T[:3, :3] @ point + T[:3, 3]
 
 

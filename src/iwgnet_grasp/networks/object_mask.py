@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from iwgnet_grasp.networks.backends import make_runner
 from iwgnet_grasp.networks.grasp_network import conv_block
-from iwgnet_grasp.networks.onnx_model import InferenceModel
+from iwgnet_grasp.networks.onnx_model import InferenceModel, OneOutput
 from iwgnet_grasp.networks.probes import probe_heights, probe_image
 from iwgnet_grasp.networks.weights import WeightsError, load_state, read_card, weights_path
 
@@ -60,17 +60,6 @@ class ObjectMask(nn.Module):
         return self.head(deep)[:, 0]
 
 
-class _Tuple(nn.Module):
-    """With the tuple of outputs that InferenceModel wants."""
-
-    def __init__(self, network: ObjectMask) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, x: Tensor) -> tuple[Tensor]:
-        return (self.network(x),)
-
-
 def normalise_grey(grey: np.ndarray) -> np.ndarray:
     """float32 [H, W] of mean 0 and deviation 1: light and camera's gain make no difference."""
     grey = grey.astype(np.float32)
@@ -103,7 +92,7 @@ class MaskEstimator:
         network, self.card = load_object_mask(weights)
         grey = probe_image((INPUT_PX, INPUT_PX))[..., 0]
         probe = np.stack([probe_heights(INPUT_PX), normalise_grey(grey)])[None]
-        model = InferenceModel(_Tuple(network).eval(), probe, "window", ("logit",))
+        model = InferenceModel(OneOutput(network).eval(), probe, "window", ("logit",))
         self.backend, self._run = make_runner(model, backend)
 
     def predict(self, heights: np.ndarray, greys: np.ndarray) -> np.ndarray:

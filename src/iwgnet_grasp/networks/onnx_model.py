@@ -19,6 +19,17 @@ import torch
 OPSET = 17  # the newest that torch's TorchScript exporter writes without a conversion
 
 
+class OneOutput(torch.nn.Module):
+    """A network that gives one tensor, with the tuple of outputs that InferenceModel wants."""
+
+    def __init__(self, network: torch.nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor]:
+        return (self.network(x),)
+
+
 @dataclass(frozen=True)
 class InferenceModel:
     """A network with one input and what every library has to know of it."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from iwgnet_grasp.networks.backends import make_runner
 from iwgnet_grasp.networks.grasp_network import conv_block
-from iwgnet_grasp.networks.onnx_model import InferenceModel
+from iwgnet_grasp.networks.onnx_model import InferenceModel, OneOutput
 from iwgnet_grasp.networks.probes import probe_heights
 from iwgnet_grasp.networks.weights import WeightsError, load_state, read_card, weights_path
 from iwgnet_grasp.perception.grasp_view import CHANNELS, VIEW_CELLS
@@ -52,17 +52,6 @@ class PickOutcome(nn.Module):
         return self.head(self.features(x))
 
 
-class _Tuple(nn.Module):
-    """With the tuple of outputs that InferenceModel wants."""
-
-    def __init__(self, network: PickOutcome) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, x: Tensor) -> tuple[Tensor]:
-        return (self.network(x),)
-
-
 def load_pick_outcome(name_or_path: str | Path) -> tuple[PickOutcome, dict[str, Any]]:
     """The network in eval mode and its card. Raises WeightsError."""
     path = weights_path(name_or_path)
@@ -82,7 +71,7 @@ class OutcomeEstimator:
         network, self.card = load_pick_outcome(weights)
         probe = np.zeros((1, CHANNELS, VIEW_CELLS, VIEW_CELLS), np.float32)
         probe[0, 0] = probe_heights(VIEW_CELLS)
-        model = InferenceModel(_Tuple(network).eval(), probe, "view", ("logits",))
+        model = InferenceModel(OneOutput(network).eval(), probe, "view", ("logits",))
         self.backend, self._run = make_runner(model, backend)
 
     def predict(self, views: np.ndarray) -> np.ndarray:

@@ -2,9 +2,8 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import lightning
 import torch
 import typer
 from rich.progress import Progress
@@ -19,7 +18,7 @@ from iwgnet_grasp.networks import count_parameters
 from iwgnet_grasp.networks.object_mask import INPUT_PX, NAME, ObjectMask, mask_loss
 from iwgnet_grasp.networks.weights import load_state, save_weights, weights_path
 from iwgnet_grasp.training.card import describe_set
-from iwgnet_grasp.training.fitting import fit, one_cycle, prepare
+from iwgnet_grasp.training.fitting import SmallTraining, fit, prepare
 
 
 @dataclass(frozen=True)
@@ -35,48 +34,32 @@ class MaskTrainingSettings:
     seed: int = 0
 
 
-class MaskTraining(lightning.LightningModule):
+class MaskTraining(SmallTraining):
     """AdamW with a one-cycle schedule on mask_loss, validated by the mean IoU of the masks."""
 
     def __init__(
         self, settings: MaskTrainingSettings, training: MaskViews, validation: MaskViews
     ) -> None:
-        super().__init__()
-        self.settings, self.views, self.held_out = settings, training, validation
-        # What a checkpoint must agree in.
-        self.run: dict[str, Any] = asdict(settings) | {"samples": len(training)}
-        self.network = ObjectMask().to(memory_format=torch.channels_last)
+        super().__init__(settings, ObjectMask(), len(training))
+        self.views, self.held_out = training, validation
 
     def train_dataloader(self) -> DataLoader:
-        """Made anew each epoch: a function of seed and epoch alone."""
-        seed = (self.settings.seed, self.current_epoch)
-        dataset = MaskDataset(self.views, INPUT_PX, Augmentation(), seed)
-        order = torch.Generator().manual_seed(hash(seed))
-        batch = min(self.settings.batch, len(dataset))
-        return DataLoader(dataset, batch, shuffle=True, drop_last=True, generator=order)
+        return self.shuffled(lambda seed: MaskDataset(self.views, INPUT_PX, Augmentation(), seed))
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(MaskDataset(self.held_out, INPUT_PX), self.settings.batch)
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
         windows, masks = batch
-        logits = self.network(windows.to(memory_format=torch.channels_last))
-        loss = mask_loss(logits.float(), masks)
+        loss = mask_loss(self.logits(windows), masks)
         self.log("train/loss", loss, batch_size=len(masks))
         return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         windows, masks = batch
-        logits = self.network(windows.to(memory_format=torch.channels_last)).float()
+        logits = self.logits(windows)
         scores = {"val/loss": mask_loss(logits, masks), "val/iou": iou(logits > 0, masks > 0.5)}
         self.log_dict(scores, batch_size=len(masks), prog_bar=True)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["run"] = self.run
-
-    def configure_optimizers(self) -> dict[str, Any]:
-        s = self.settings
-        return one_cycle(self, s.learning_rate, s.weight_decay, s.warm_up)
 
 
 def iou(found: Tensor, truth: Tensor) -> Tensor:

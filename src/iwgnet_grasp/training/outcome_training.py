@@ -2,9 +2,8 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import lightning
 import numpy as np
 import torch
 import typer
@@ -25,7 +24,7 @@ from iwgnet_grasp.networks.pick_outcome import (
 )
 from iwgnet_grasp.networks.weights import save_weights
 from iwgnet_grasp.training.card import short_generator
-from iwgnet_grasp.training.fitting import fit, one_cycle, prepare
+from iwgnet_grasp.training.fitting import SmallTraining, fit, prepare
 
 
 @dataclass(frozen=True)
@@ -42,40 +41,31 @@ class OutcomeTrainingSettings:
     seed: int = 0
 
 
-class OutcomeTraining(lightning.LightningModule):
+class OutcomeTraining(SmallTraining):
     """Cross entropy, validated by how well the outputs order picks by what became of them."""
 
     def __init__(
         self, settings: OutcomeTrainingSettings, training: PickViews, validation: PickViews
     ) -> None:
-        super().__init__()
-        self.settings, self.picks, self.held_out = settings, training, validation
-        # What a checkpoint must agree in.
-        self.run: dict[str, Any] = asdict(settings) | {"samples": len(training)}
-        self.network = PickOutcome().to(memory_format=torch.channels_last)
+        super().__init__(settings, PickOutcome(), len(training))
+        self.picks, self.held_out = training, validation
         self._logits: list[Tensor] = []
 
     def train_dataloader(self) -> DataLoader:
-        """Made anew each epoch: a function of seed and epoch alone."""
-        seed = (self.settings.seed, self.current_epoch)
-        dataset = PickViewDataset(self.picks, seed)
-        order = torch.Generator().manual_seed(hash(seed))
-        batch = min(self.settings.batch, len(dataset))
-        return DataLoader(dataset, batch, shuffle=True, drop_last=True, generator=order)
+        return self.shuffled(lambda seed: PickViewDataset(self.picks, seed))
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(PickViewDataset(self.held_out), self.settings.batch)
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
         views, outcomes = batch
-        logits = self.network(views.to(memory_format=torch.channels_last))
-        loss = outcome_loss(logits.float(), outcomes)
+        loss = outcome_loss(self.logits(views), outcomes)
         self.log("train/loss", loss, batch_size=len(outcomes))
         return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         views, _ = batch
-        self._logits.append(self.network(views.to(memory_format=torch.channels_last)).float())
+        self._logits.append(self.logits(views))
 
     def on_validation_epoch_end(self) -> None:
         logits = torch.cat(self._logits)
@@ -85,13 +75,6 @@ class OutcomeTraining(lightning.LightningModule):
         for i, name in enumerate(OUTPUTS):
             area = area_under_curve(logits[:, i], truth[:, i])
             self.log(f"val/auc_{name}", area.float(), prog_bar=True)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["run"] = self.run
-
-    def configure_optimizers(self) -> dict[str, Any]:
-        s = self.settings
-        return one_cycle(self, s.learning_rate, s.weight_decay, s.warm_up)
 
 
 def train_outcome_network(

@@ -194,7 +194,7 @@ def inputs(conditions: Conditions) -> dict[str, str]:
         if path.name in _NOT_OF_TRIALS:
             continue
         contents[name] = (PACKAGE / "config" / path.name).read_bytes()
-    for part in ("detector", "masks", "grasps"):
+    for part in ("detector", "masks", "outcomes", "grasps"):
         weights = perception[part]["weights"]
         try:
             contents[weights] = (PACKAGE / weights).read_bytes()
