@@ -35,6 +35,17 @@ void bind_motion(py::module_& m) {
           "of the path planner")
       .def_readwrite("grip_force", &PickPlaceConfig::grip_force, "N");
   m.def("load_pick_place_config", &motion::load_pick_place_config, "config_dir"_a);
+  m.def(
+      "find_pushes",
+      [](const grasping::HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
+         const CellConfig& cell, const PickPlaceConfig& config) {
+        std::vector<std::pair<Eigen::Vector2d, Eigen::Vector2d>> ways;
+        for (const auto& push : grasping::find_pushes(heights, objects, cell, config.push))
+          ways.emplace_back(push.from, push.to);
+        return ways;
+      },
+      "heights"_a, "objects"_a, "cell"_a, "config"_a,
+      "Pushes against objects (3,) m in base_link as [(from, to)] (2,) m, the best first.");
   py::class_<PickAndPlace>(m, "PickAndPlace",
                            "Approach, grasp, lift, transfer, release, back to observing.")
       .def(py::init<const CellConfig&, const PickPlaceConfig&>(), "cell"_a, "config"_a)
@@ -52,6 +63,15 @@ void bind_motion(py::module_& m) {
           "robot"_a, "grasp"_a, "centroid"_a, "tray_slot"_a, "phase"_a = py::none(),
           "One pick; blocks, without the GIL. centroid: (3,) m in base_link. phase(name) -> bool is "
           "told each phase as it begins and cancels by returning False.")
+      .def(
+          "push",
+          [](PickAndPlace& self, motion::Robot& robot, const std::vector<Eigen::Vector3d>& objects) {
+            py::gil_scoped_release release;
+            return self.push(robot, objects);
+          },
+          "robot"_a, "objects"_a,
+          "Pushes one of the objects, given by their centroids (3,) m in base_link; blocks, without "
+          "the GIL.")
       .def(
           "observe",
           [](PickAndPlace& self, motion::Robot& robot) {

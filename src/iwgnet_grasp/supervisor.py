@@ -60,6 +60,10 @@ class Cell(Protocol):
     def execute(self, target: Target, tray_slot: int) -> Outcome:
         """Picks the object and puts it into the tray; the arm ends out of the camera's view."""
 
+    def push(self, scene_id: int) -> Outcome:
+        """Pushes some object of the newest plan aside, so that the pile lies otherwise; the arm
+        ends out of the camera's view. Nothing is gripped."""
+
     def time(self) -> float:
         """Seconds on the cell's clock."""
 
@@ -77,6 +81,8 @@ class Settings:
     max_attempts: int
     max_idle_looks: int
     min_quality: float
+    push_below: float
+    max_pushes: int
 
     def __post_init__(self) -> None:
         if self.replan not in ("once", "every"):
@@ -85,8 +91,11 @@ class Settings:
             value = getattr(self, key)
             if not (isinstance(value, int) and value > 0):
                 raise ValueError(f"{key}: {value!r} is not a whole number above 0")
-        if not isinstance(self.min_quality, int | float):
-            raise ValueError(f"min_quality: {self.min_quality!r} is not a number")
+        if not (isinstance(self.max_pushes, int) and self.max_pushes >= 0):
+            raise ValueError(f"max_pushes: {self.max_pushes!r} is not a whole number from 0")
+        for key in ("min_quality", "push_below"):
+            if not isinstance(getattr(self, key), int | float):
+                raise ValueError(f"{key}: {getattr(self, key)!r} is not a number")
 
 
 def load_settings(config_dir: str | Path, **changes: object) -> Settings:
@@ -128,6 +137,7 @@ class Cycle:
     attempts: list[Attempt] = field(default_factory=list)
     failed: list[GraspRectangle] = field(default_factory=list)
     looks: int = 0
+    pushes: int = 0
     ended: str = ""
 
 
@@ -165,12 +175,22 @@ def clear_table(
     (CellError, KeyboardInterrupt) ends it early."""
     cycle = Cycle() if cycle is None else cycle
     idle_looks = 0
+    pushes = 0  # since the last pick
     slot = 0
     while True:
         scene_id = cell.look()
         cycle.looks += 1
         targets = cell.plan(scene_id, cycle.failed)
         graspable = execution_order(targets, settings.min_quality)
+        best = max((target.quality for target in graspable), default=0.0)
+        may_push = settings.replan == "every" and pushes < settings.max_pushes
+        if targets and best < settings.push_below and may_push:
+            pushes += 1
+            outcome = cell.push(scene_id)
+            if outcome.success:
+                cycle.pushes += 1
+                say(f"push {cycle.pushes}: no grasp of look {scene_id} is better than Q {best:.2f}")
+                continue
         if not graspable:
             # Noise differs from look to look: an object may be seen, or be graspable, in the next.
             idle_looks += 1
@@ -183,7 +203,7 @@ def clear_table(
                 cycle.ended = "nothing_graspable"
                 return cycle
             continue
-        idle_looks = 0
+        idle_looks = pushes = 0
         taken: list[int] = []  # with replan=once, of this look
         tried: set[int] = set()
         while graspable:

@@ -175,6 +175,15 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.lower_speed = positive("lower_speed");
   config.contact_tolerance = file.vector("contact_tolerance", kJoints);
   if (!(config.contact_tolerance.minCoeff() > 0)) file.fail("contact_tolerance", "must be positive");
+  config.push.gap = positive("push.gap");
+  config.push.tip_height = positive("push.tip_height");
+  config.push.clearance = positive("push.clearance");
+  config.push.run_up = positive("push.run_up");
+  config.push.distance = positive("push.distance");
+  config.push.margin = positive("push.margin");
+  config.push.speed = positive("push.speed");
+  if (config.push.gap < config.held_gap_min)
+    file.fail("push.gap", "must not be below held_gap_min: pushing is not gripping");
   return config;
 }
 
@@ -431,6 +440,83 @@ Trajectory PickAndPlace::retreat_from(const JointVector& q, const PickPlan& plan
   up.limits = home.limits = config_.limits;
   std::string why;
   return timed({up, home}, why);
+}
+
+bool PickAndPlace::plan_push(const JointVector& start, const grasping::Push& push,
+                             Trajectory& approach, Trajectory& sweep, std::string& why) {
+  const Eigen::Vector2d way = push.to - push.from;
+  Pose T = Pose::Identity();  // closes across the way: so the fingers do not give
+  T.linear().col(2) = -Eigen::Vector3d::UnitZ();
+  T.linear().col(1) << way.normalized(), 0.0;
+  T.linear().col(0) = T.linear().col(1).cross(T.linear().col(2));
+  T.translation() << push.from, config_.push.tip_height + kinematics::kPadHeight / 2;
+  world_.set_attached(std::nullopt);
+  world_.set_gripper_gap(config_.push.gap);
+  world_.set_columns({Column(T)});
+  for (const Reached& r : reach(world_, {T, half_turn(T)}, config_.push.gap, config_.approach_height,
+                                start, config_.limits, why)) {
+    const PlanResult there = motion::plan(world_, start, r.high, config_.planner);
+    if (!there.success) {
+      why = there.message;
+      continue;
+    }
+    PathLeg over, down, along;
+    over.path = there.path;
+    down.path = reversed(r.up);
+    over.limits = down.limits = along.limits = config_.limits;
+    down.max_tool_speed = config_.approach_speed;
+    approach = timed({over, down}, why);
+    if (approach.empty()) continue;
+    Pose end = kinematics::forward(r.low);
+    end.translation().head<2>() += way;
+    const PlanResult straight = plan_straight(world_, r.low, end, false);
+    if (!straight.success) {
+      why = straight.message;
+      continue;
+    }
+    along.path = straight.path;
+    along.max_tool_speed = config_.push.speed;
+    along.deviation = 0.0;
+    sweep = time_parametrize({along});
+    return true;
+  }
+  return false;
+}
+
+PickResult PickAndPlace::push(Robot& robot, const std::vector<Eigen::Vector3d>& objects) {
+  const auto began = Clock::now();
+  PickResult result;
+  result.reason = PickReason::kUnreachable;
+  result.message = "no room for the fingers to push from";
+  Trajectory approach, sweep;
+  const JointVector start = start_of(robot);
+  for (const grasping::Push& push : grasping::find_pushes(heights_, objects, cell_, config_.push)) {
+    if (!plan_push(start, push, approach, sweep, result.message)) continue;
+    result.reason = PickReason::kSucceeded;
+    result.message.clear();
+    break;
+  }
+  result.planning_seconds = seconds_since(began);
+  if (result.reason != PickReason::kSucceeded) return result;
+
+  const auto fail = [&](const std::string& message) {
+    result.reason = PickReason::kExecutionFailed;
+    result.message = message;
+  };
+  const GripResult closed = robot.preset(config_.push.gap, config_.grip_force);
+  if (!closed.success) {
+    fail("the gripper did not move: " + closed.message);
+    return result;
+  }
+  for (const Trajectory* trajectory : {&approach, &sweep}) {
+    const ExecutionResult moved = move(robot, *trajectory);
+    if (moved.success) continue;
+    fail("push: " + moved.message);
+    break;
+  }
+  const PickResult home = observe(robot);
+  if (home.reason != PickReason::kSucceeded) fail(home.message);
+  return result;
 }
 
 PickResult PickAndPlace::observe(Robot& robot) {

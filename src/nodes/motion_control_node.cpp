@@ -1,10 +1,11 @@
-// Node 4: plans and executes one pick and place at a time through the arm's trajectory controller
+// Node 4: plans and executes one pick and place, or one push, at a time through the arm's trajectory controller
 // and gripper_control.
 #include <actionlib/server/simple_action_server.h>
 #include <control_msgs/FollowJointTrajectoryAction.h>
 #include <iwgnet_grasp/GraspPoses.h>
 #include <iwgnet_grasp/GripAction.h>
 #include <iwgnet_grasp/PickPlaceAction.h>
+#include <iwgnet_grasp/PushAction.h>
 #include <iwgnet_grasp/Scene.h>
 #include <iwgnet_grasp/Topics.h>
 #include <std_srvs/Trigger.h>
@@ -12,6 +13,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <limits>
 #include <mutex>
 
@@ -45,6 +47,12 @@ class RosRobot : public motion::Robot {
     grip_goal_.object_id = object_id;
     cancelled_ = std::move(cancelled);
     closed_ = false;
+  }
+
+  // The same for a motion without an object: topic 4 has no opening for it.
+  void begin(std::function<bool()> cancelled) {
+    begin(0, 0, std::move(cancelled));
+    closed_ = true;
   }
 
   JointVector joints() override {
@@ -174,11 +182,13 @@ class MotionControl {
         robot_(config_.held_gap_min),
         transforms_(buffer_),
         server_(Topics::PICK_PLACE, [this](const PickPlaceGoalConstPtr& goal) { pick(*goal); },
-                false) {
+                false),
+        push_server_(Topics::PUSH, [this](const PushGoalConstPtr& goal) { push(*goal); }, false) {
     scene_subscriber_ = node_.subscribe(Topics::SCENE, 1, &MotionControl::on_scene, this);
     poses_subscriber_ = node_.subscribe(Topics::GRASP_POSE, 2, &MotionControl::on_poses, this);
     observe_service_ = node_.advertiseService(Topics::OBSERVE, &MotionControl::observe, this);
     server_.start();
+    push_server_.start();
   }
 
  private:
@@ -198,8 +208,9 @@ class MotionControl {
     poses_ = poses;
   }
 
-  // The grasp of a goal with the heights of its scene given to the planner.
-  motion::PickRequest request_for(const PickPlaceGoal& goal) {
+  // The grasp poses of a scene, whose heights the planner is given. Throws Error when they do not
+  // come; `what` they are for.
+  GraspPoses::ConstPtr poses_of(std::uint32_t scene_id, const std::string& what) {
     GraspPoses::ConstPtr poses;
     Scene::ConstPtr scene;
     // Topics and goals come by different connections: the goal may be the first to arrive.
@@ -210,34 +221,37 @@ class MotionControl {
         poses = poses_;
         scene = scene_;
       }
-      if (poses && scene && poses->scene_id == goal.scene_id && scene->scene_id == goal.scene_id)
-        break;
+      if (poses && scene && poses->scene_id == scene_id && scene->scene_id == scene_id) break;
       ros::WallDuration(0.005).sleep();
     } while (ros::ok() && ros::WallTime::now() < deadline);
+    if (!poses || poses->scene_id != scene_id)
+      throw Error(Topics::GRASP_POSE + " holds nothing for " + what);
+    if (poses->header.frame_id != Topics::BASE_FRAME)
+      throw Error(Topics::GRASP_POSE + " is in frame '" + poses->header.frame_id + "', expected '" +
+                  Topics::BASE_FRAME + "'");
+    if (!scene || scene->scene_id != scene_id)
+      throw Error(Topics::SCENE + " holds no depth for " + what);
+    if (scene_with_heights_ != scene) {
+      const cv::Mat depth = depth_image(scene->depth, Topics::SCENE);
+      pick_and_place_.set_heights(
+          grasping::HeightMap(depth, from_message(scene->camera_info),
+                              camera_transform(buffer_, scene->header.frame_id), cell_));
+      scene_with_heights_ = scene;
+    }
+    return poses;
+  }
+
+  motion::PickRequest request_for(const PickPlaceGoal& goal) {
     const std::string which = "object " + std::to_string(goal.object_id) + " of scene " +
                               std::to_string(goal.scene_id);
     const int slots = cell_.tray.columns * cell_.tray.rows;
     if (goal.tray_slot >= static_cast<std::uint32_t>(slots))
       throw Error("tray slot " + std::to_string(goal.tray_slot) + " does not exist: the tray has " +
                   std::to_string(slots));
-    if (!poses || poses->scene_id != goal.scene_id)
-      throw Error(Topics::GRASP_POSE + " holds nothing for " + which);
-    if (poses->header.frame_id != Topics::BASE_FRAME)
-      throw Error(Topics::GRASP_POSE + " is in frame '" + poses->header.frame_id + "', expected '" +
-                  Topics::BASE_FRAME + "'");
-    if (!scene || scene->scene_id != goal.scene_id)
-      throw Error(Topics::SCENE + " holds no depth for " + which);
-    for (const GraspPose& grasp : poses->grasps) {
-      if (grasp.object_id != goal.object_id) continue;
-      if (scene_with_heights_ != scene) {
-        const cv::Mat depth = depth_image(scene->depth, Topics::SCENE);
-        pick_and_place_.set_heights(grasping::HeightMap(
-            depth, from_message(scene->camera_info),
-            camera_transform(buffer_, scene->header.frame_id), cell_));
-        scene_with_heights_ = scene;
-      }
-      return {from_message(grasp), from_message(grasp.centroid), static_cast<int>(goal.tray_slot)};
-    }
+    const GraspPoses::ConstPtr poses = poses_of(goal.scene_id, which);
+    for (const GraspPose& grasp : poses->grasps)
+      if (grasp.object_id == goal.object_id)
+        return {from_message(grasp), from_message(grasp.centroid), static_cast<int>(goal.tray_slot)};
     throw Error(Topics::GRASP_POSE + " holds nothing for " + which);
   }
 
@@ -275,6 +289,32 @@ class MotionControl {
       server_.setAborted(result, result.message);
   }
 
+  void push(const PushGoal& goal) {
+    const std::lock_guard motion_lock(motion_mutex_);
+    PushResult result;
+    try {
+      const GraspPoses::ConstPtr poses =
+          poses_of(goal.scene_id, "scene " + std::to_string(goal.scene_id));
+      std::vector<Eigen::Vector3d> objects;
+      for (const GraspPose& grasp : poses->grasps)
+        if (std::isfinite(grasp.centroid.x)) objects.push_back(from_message(grasp.centroid));
+      robot_.begin([this] { return push_server_.isPreemptRequested() || !ros::ok(); });
+      const motion::PickResult pushed = pick_and_place_.push(robot_, objects);
+      result.success = pushed.reason == motion::PickReason::kSucceeded;
+      result.message = pushed.message;
+    } catch (const Error& error) {
+      result.message = error.what();
+    }
+    ROS_INFO("motion_control: push in scene %u: %s", goal.scene_id,
+             result.success ? "done" : result.message.c_str());
+    if (push_server_.isPreemptRequested())
+      push_server_.setPreempted(result, result.message);
+    else if (result.success)
+      push_server_.setSucceeded(result, result.message);
+    else
+      push_server_.setAborted(result, result.message);
+  }
+
   bool observe(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {
     const std::unique_lock motion_lock(motion_mutex_, std::try_to_lock);
     if (!motion_lock) {
@@ -282,7 +322,7 @@ class MotionControl {
       return true;
     }
     try {
-      robot_.begin(0, 0, [] { return !ros::ok(); });
+      robot_.begin([] { return !ros::ok(); });
       const motion::PickResult result = pick_and_place_.observe(robot_);
       response.success = result.reason == motion::PickReason::kSucceeded;
       response.message = result.message;
@@ -307,6 +347,7 @@ class MotionControl {
   ros::Subscriber scene_subscriber_, poses_subscriber_;
   ros::ServiceServer observe_service_;
   actionlib::SimpleActionServer<PickPlaceAction> server_;
+  actionlib::SimpleActionServer<PushAction> push_server_;
 };
 
 }  // namespace

@@ -8,6 +8,8 @@
 #include <tf2_ros/transform_listener.h>
 #include <visualization_msgs/MarkerArray.h>
 
+#include <limits>
+
 #include "camera_transform.h"
 #include "conversions.h"
 #include "iwgnet_grasp/kinematics/robotiq_2f85.h"
@@ -144,7 +146,8 @@ class SpatialTransform {
       }
       message.object_id = object.object_id;
       message.grasp = object.grasps.at(pose.candidate);
-      if (centroid) message.centroid = to_message(*centroid);
+      message.centroid = to_message(
+          centroid.value_or(Eigen::Vector3d::Constant(std::numeric_limits<double>::quiet_NaN())));
       GripperWidth width;
       width.object_id = object.object_id;
       width.opening = pose.opening;

@@ -128,6 +128,26 @@ TEST_F(PickCycle, CancelledBeforeTheLiftLeavesThePart) {
   expect_observing();
 }
 
+TEST_F(PickCycle, PushesAPartAsideWithoutAttemptingToGraspIt) {
+  SimulatedRobot robot(*cell);
+  const CameraConfig& camera = cell->config().camera;
+  picker->set_heights(grasping::HeightMap(cell->ideal_depth(), camera.color, camera.T_base_color,
+                                          cell->config()));
+  const Pose before = cell->world().part(1).T_base_part;
+  const double start = cell->time();
+  const PickResult result = picker->push(robot, {before.translation()});
+  EXPECT_EQ(result.reason, PickReason::kSucceeded) << result.message;
+  EXPECT_GT(moved(1, before), 0.02);
+  EXPECT_LT(moved(1, before), 0.10);
+  EXPECT_LT(cell->time() - start, 5.0);
+  const Verdict verdict = cell->verdict();
+  EXPECT_TRUE(verdict.picks.empty());
+  EXPECT_TRUE(verdict.collisions.empty());
+  EXPECT_EQ(verdict.on_table, verdict.parts);
+  expect_observing();
+  EXPECT_EQ(picker->push(robot, {}).reason, PickReason::kUnreachable);
+}
+
 TEST_F(PickCycle, StoppedOnTheWayToThePart) {
   StoppingRobot robot(*cell, 0);
   const Pose before = cell->world().part(3).T_base_part;

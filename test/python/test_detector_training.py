@@ -348,7 +348,7 @@ def test_command_writes_weights_that_load_and_a_card(tmp_path, capsys):
         " balance: [4.0, 1.0, 0.4]}\n"
     )
     output = tmp_path / "models" / "tiny.safetensors"
-    train_detector(data=tmp_path / "set", output=output, config=config, run=tmp_path / "run")
+    train_detector(data=[tmp_path / "set"], output=output, config=config, run=tmp_path / "run")
     card = read_card(output)
     assert card["network"] == "yolov5s" and card["labels"] == ["connecting_rod"]
     assert card["input"] == [128, 160] and card["parameters"] == 7_022_326
@@ -360,7 +360,7 @@ def test_command_writes_weights_that_load_and_a_card(tmp_path, capsys):
 
     later = tmp_path / "models" / "later.safetensors"
     train_detector(
-        data=tmp_path / "set",
+        data=[tmp_path / "set", tmp_path / "set"],
         output=later,
         config=config,
         run=tmp_path / "later",
@@ -369,6 +369,7 @@ def test_command_writes_weights_that_load_and_a_card(tmp_path, capsys):
     )
     before = read_card(later)["before"]  # of the first stage what differs
     assert before["training"] == {"seed": 3} and before["steps"] == 2
+    assert read_card(later)["data"]["scenes"] == 6
     assert before["validation"] == card["validation"]
 
 

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from iwgnet_grasp.trials.overrides import OverrideError, changed_config, parse_overrides
+from iwgnet_grasp.overrides import OverrideError, changed_config, parse_overrides
 from iwgnet_grasp.trials.worker import PACKAGE
 
 CONFIG = PACKAGE / "config"

@@ -18,12 +18,14 @@ from iwgnet_grasp.trials.record import run_trial, summary_line, write_json
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 PICK_SECONDS = 8.0
+PUSH_SECONDS = 3.0
 
 
 class Table:
-    """A Cell whose objects need a given number of tries; None: no grasp on it ever is feasible."""
+    """A Cell whose objects need a given number of tries; None: no grasp on it ever is feasible.
+    Their grasps have a quality of 1, after each push that of the next of `qualities`."""
 
-    def __init__(self, tries, fatal_pick=None, error=None):
+    def __init__(self, tries, fatal_pick=None, error=None, qualities=(1.0,), pushes=True):
         self.tries = dict(enumerate(tries))
         self.clock = 0.0
         self.looks = 0
@@ -31,6 +33,7 @@ class Table:
         self.failed_seen, self.taken_seen = [], []
         self.fatal_pick, self.error = fatal_pick, error
         self.picks = []  # the judge's
+        self.qualities, self.pushes_succeed, self.pushed = list(qualities), pushes, []
 
     def look(self):
         self.looks += 1
@@ -49,6 +52,7 @@ class Table:
                 GraspRectangle(10.0 * i, 5.0, 0.1, 20.0, 0.8, 0.58),
                 feasible=tries is not None,
                 reason="" if tries is not None else "fingers collide",
+                quality=self.qualities[0],
             )
             for i, tries in self.tries.items()
         ]
@@ -73,6 +77,13 @@ class Table:
             }
         )
         return Outcome(success, "" if success else "missed")
+
+    def push(self, scene_id):
+        self.pushed.append(scene_id)
+        self.clock += PUSH_SECONDS
+        if self.pushes_succeed and len(self.qualities) > 1:
+            self.qualities.pop(0)
+        return Outcome(self.pushes_succeed, "" if self.pushes_succeed else "not_pushed")
 
     def time(self):
         return self.clock
@@ -123,6 +134,32 @@ def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():
     assert [t.object_id for t in execution_order(targets, 0.0)] == [0, 1, 2, 3]
 
 
+def test_where_no_grasp_is_good_an_object_is_pushed_aside_and_it_looks_again():
+    table = Table([1], qualities=[0.02, 0.05, 0.9])
+    said = []
+    settings = load_settings(CONFIG, replan="every", push_below=0.1, max_pushes=2)
+    cycle = clear_table(table, settings, said.append)
+    assert cycle.ended == "cleared" and cycle.pushes == 2
+    assert table.pushed == [1, 2] and cycle.attempts[0].target.scene_id == 3
+    assert len(said) == 3 and "Q 0.02" in said[0]
+
+
+def test_pushes_in_a_row_are_bounded_and_one_that_cannot_be_done_ends_nothing():
+    settings = load_settings(CONFIG, replan="every", push_below=0.1, max_pushes=2)
+    table = Table([1, 1], qualities=[0.02])
+    cycle = clear_table(table, settings, quiet)
+    assert cycle.ended == "cleared" and cycle.pushes == 4  # two before each of two picks
+    stuck = Table([1], qualities=[0.02], pushes=False)
+    cycle = clear_table(stuck, settings, quiet)
+    assert cycle.ended == "cleared" and cycle.pushes == 0 and len(stuck.executed) == 1
+
+
+def test_one_look_has_no_pushes():
+    table = Table([1], qualities=[0.02])
+    cycle = clear_table(table, load_settings(CONFIG, replan="once", push_below=0.1), quiet)
+    assert table.pushed == [] and len(cycle.attempts) == 1
+
+
 def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again():
     table = Table([2, 1])
     cycle = clear_table(table, load_settings(CONFIG, replan="every"), quiet)
@@ -134,7 +171,8 @@ def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again
 def test_the_cycle_gives_up_when_nothing_is_graspable():
     table = Table([None, None])
     said = []
-    cycle = clear_table(table, load_settings(CONFIG, replan="every", max_idle_looks=3), said.append)
+    settings = load_settings(CONFIG, replan="every", max_idle_looks=3, max_pushes=0)
+    cycle = clear_table(table, settings, said.append)
     assert cycle.ended == "nothing_graspable"
     assert table.looks == 3
     assert len(said) == 2 and all("fingers collide" in line for line in said)

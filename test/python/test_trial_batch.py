@@ -14,6 +14,7 @@ import pytest
 from test_trial_statistics import pick, record
 
 from iwgnet_grasp.cluster import ClusterError, connect
+from iwgnet_grasp.overrides import changed_config
 from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials import batch
 from iwgnet_grasp.trials.batch import BatchError, Run, read_records, read_run, run_trials
@@ -24,7 +25,6 @@ from iwgnet_grasp.trials.comparison import (
     read_comparison,
     sweep,
 )
-from iwgnet_grasp.trials.overrides import changed_config
 from iwgnet_grasp.trials.pool import PoolError, run_with_ray
 from iwgnet_grasp.trials.worker import PACKAGE, Conditions, InProcessWorker
 

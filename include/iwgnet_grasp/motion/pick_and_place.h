@@ -10,8 +10,10 @@
 #include <limits>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "iwgnet_grasp/grasping/grasp_pose.h"
+#include "iwgnet_grasp/grasping/push.h"
 #include "iwgnet_grasp/motion/planner.h"
 
 namespace iwgnet_grasp::motion {
@@ -67,6 +69,7 @@ struct PickPlaceConfig {  // config/motion.yaml
   double max_fall;                // m, by how much a part may reach less far down than was assumed
   double lower_speed;             // m/s of the tool where that may happen
   JointVector contact_tolerance;  // rad, joints held back by more have met something
+  grasping::PushConfig push;
 };
 PickPlaceConfig load_pick_place_config(const std::string& config_dir);  // Throws Error.
 
@@ -109,6 +112,9 @@ class PickAndPlace {
   // Whatever happens, the arm ends at the observing pose if it can be brought there.
   PickResult run(Robot& robot, const PickRequest& request,
                  const std::function<bool(const std::string&)>& phase = {});
+  // Pushes one of the objects (centroids of their visible surfaces, base_link, m) with the fingers,
+  // as grasping::find_pushes() proposes, and brings the arm to the observing pose.
+  PickResult push(Robot& robot, const std::vector<Eigen::Vector3d>& objects);
   // Brings the arm to the observing pose.
   PickResult observe(Robot& robot);
 
@@ -126,6 +132,9 @@ class PickAndPlace {
   HeldPart held_part(const Pose& T_base_tcp, double width, const Eigen::Vector3d& centroid) const;
   JointVector start_of(Robot& robot) const;
   ExecutionResult move(Robot& robot, const Trajectory& trajectory, bool until_contact = false);
+  // From `start` over and down to where a push begins, and the push. False when the arm cannot.
+  bool plan_push(const JointVector& start, const grasping::Push& push, Trajectory& approach,
+                 Trajectory& sweep, std::string& why);
   // The planned way home from where the part met something; empty when it collides.
   Trajectory retreat_from(const JointVector& q, const PickPlan& plan) const;
   // The fastest trajectory along the legs that is free of collision: corners are cut less where

@@ -23,7 +23,7 @@ import io
 import json
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +41,7 @@ from iwgnet_grasp.data.jacquard import format_grasps
 from iwgnet_grasp.data.lift_check import as_text, plan_check, require_stored, summary
 from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
 from iwgnet_grasp.files import disk_error, write_whole
+from iwgnet_grasp.overrides import OverrideError, changed_config, parse_overrides
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
 from iwgnet_grasp.perception.types import Box, Window
@@ -497,20 +498,22 @@ def generate_dataset(
     address: str | None = None,
     lift_check: int = 0,
     detector: bool = True,
+    changes: Sequence[str] = (),
     package_dir: Path = PACKAGE,
 ) -> tuple[int, int]:
     """Makes the scenes 0 .. scenes-1 that are not there yet and lifts about `lift_check` labels of
     the set; returns the numbers of scenes and crops that the folder then holds.
 
     workers: processes of this machine, or actors on the Ray cluster at `address`; 0: one for each
-    core. detector: with colour images. DataError for arguments that cannot be used and when there
-    is no room on the disk. Whatever ends the run, annotations.json then fits the scenes on disk.
+    core. detector: with colour images. changes: KEY.KEY=VALUE, in place of config/dataset.yaml's.
+    DataError for arguments that cannot be used and when there is no room on the disk. Whatever ends
+    the run, annotations.json then fits the scenes on disk.
     """
     unknown = sorted(set(families) - set(known_families(package_dir)))
     if unknown or not families:
         known = ", ".join(known_families(package_dir))
         raise DataError(f"families: '{', '.join(unknown)}' not in the part library ({known})")
-    settings = yaml.safe_load(CONFIG.read_text())
+    settings = changed_settings(changes)
     # Detector classes: connecting_rod first wherever it takes part, then by name.
     categories = sorted(families, key=lambda name: (name != "connecting_rod", name))
     kind = SceneKind(tuple(categories), settings, library_digest(package_dir, families), detector)
@@ -535,6 +538,16 @@ def generate_dataset(
         again = "run the same command again to go on"
         raise DataError(disk_error(error, out, again)) from None
     return counts
+
+
+def changed_settings(changes: Sequence[str]) -> dict:
+    """config/dataset.yaml with changes KEY.KEY=VALUE. Raises DataError."""
+    try:
+        overrides = parse_overrides([f"{CONFIG.stem}.{change}" for change in changes])
+        with changed_config(CONFIG.parent, overrides) as folder:
+            return dict(yaml.safe_load((folder / CONFIG.name).read_text()))
+    except OverrideError as error:
+        raise DataError(str(error)) from None
 
 
 @contextlib.contextmanager
@@ -642,6 +655,14 @@ def generate(
     detector: Annotated[
         bool, typer.Option(help="Make colour images, which the detector needs (1.5x the time).")
     ] = True,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY.KEY=VALUE",
+            help="Another value in place of config/dataset.yaml's. Give it again for more.",
+        ),
+    ] = None,
     workers: Annotated[
         int, typer.Option(help="Processes, or cores of the cluster; 0: all.", min=0)
     ] = 0,
@@ -661,6 +682,8 @@ def generate(
     Examples:
 
     iwgnet dataset --scenes 200 --out data/mine
+
+    iwgnet dataset --set scene.scattered_share=0.0 --set scene.parts=[6,12] --out data/piles
 
     iwgnet dataset --mesh valve.stl --mesh-unit mm --mesh-density 2700 --out data/valves
 
@@ -689,6 +712,7 @@ def generate(
             address=address,
             lift_check=lift_check,
             detector=detector,
+            changes=changes or (),
         )
     except (DataError, PartError) as error:
         typer.echo(f"error: {error}", err=True)

@@ -383,9 +383,9 @@ def save_detector(
 
 
 def train_detector(
-    data: Annotated[Path, typer.Option(help="Folder made by 'iwgnet dataset'.")] = Path(
-        "data/train"
-    ),
+    data: Annotated[
+        list[Path], typer.Option(help="Folder made by 'iwgnet dataset'; give it again for more.")
+    ] = [Path("data/train")],  # noqa: B006
     validation_data: Annotated[
         Path | None, typer.Option(help="Folder to validate on; by default a share of --data.")
     ] = None,
@@ -402,7 +402,7 @@ def train_detector(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Instead of the config's.")] = None,
     threads: Annotated[int | None, typer.Option(help="CPU threads of torch.")] = None,
-    limit: Annotated[int | None, typer.Option(help="At most this many scenes.")] = None,
+    limit: Annotated[int | None, typer.Option(help="At most this many scenes a folder.")] = None,
     workers: Annotated[int, typer.Option(help="Processes that prepare images.")] = 0,
     devices: Annotated[int, typer.Option(help="Accelerators (or processes) a machine.")] = 1,
     nodes: Annotated[int, typer.Option(help="Machines of a distributed run.")] = 1,
@@ -415,7 +415,14 @@ def train_detector(
     if threads is not None:
         torch.set_num_threads(threads)
     start = time.monotonic()
-    train = load_detection_set(data, settings.input, limit, region=settings.region)
+    train = DetectionSet((), ())
+    for folder in data:
+        more = load_detection_set(folder, settings.input, limit, region=settings.region)
+        if train.scenes and more.classes != train.classes:
+            raise DetectorTrainingError(
+                f"{folder}: classes {more.classes} differ from the first folder's {train.classes}"
+            )
+        train = DetectionSet((*train.scenes, *more.scenes), more.classes)
     if validation_data is None:
         train, test = train.split(settings.held_out)
     else:
@@ -465,7 +472,7 @@ def rounded(metrics: dict[str, Any]) -> dict[str, Any]:
 
 def detector_card(
     settings: DetectorTrainingConfig,
-    data: Path,
+    data: Sequence[Path],
     training_count: int,
     validation_data: Path | None,
     validation_count: int,
@@ -474,7 +481,7 @@ def detector_card(
     return {
         "region": list(settings.region),
         "data": {
-            "training": [describe_set(data)],
+            "training": [describe_set(folder) for folder in data],
             "scenes": training_count,
             "validation": describe_set(validation_data) if validation_data else "a share of them",
             "validation_scenes": validation_count,

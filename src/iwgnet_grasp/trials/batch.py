@@ -17,7 +17,7 @@ from pathlib import Path
 
 import yaml
 
-from iwgnet_grasp.trials.overrides import changed_config
+from iwgnet_grasp.overrides import changed_config
 from iwgnet_grasp.trials.pool import Task, run_here, run_with_ray
 from iwgnet_grasp.trials.record import write_json
 from iwgnet_grasp.trials.statistics import Record, summary

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from iwgnet_grasp.cluster import ClusterError
+from iwgnet_grasp.overrides import parse_overrides
 from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials.batch import (
     BatchError,
@@ -24,7 +25,6 @@ from iwgnet_grasp.trials.batch import (
     scene_names,
 )
 from iwgnet_grasp.trials.comparison import compare, named_comparison, read_comparison, sweep
-from iwgnet_grasp.trials.overrides import parse_overrides
 from iwgnet_grasp.trials.pool import PoolError
 from iwgnet_grasp.trials.progress import Progress, trial_line
 from iwgnet_grasp.trials.table import print_comparison, print_table

@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
+from iwgnet_grasp.overrides import parse_override
 from iwgnet_grasp.trials.batch import BatchError, Run, inputs, read_summary
-from iwgnet_grasp.trials.overrides import parse_override
 from iwgnet_grasp.trials.record import write_json
 from iwgnet_grasp.trials.worker import PACKAGE
 

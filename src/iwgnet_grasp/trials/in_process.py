@@ -80,6 +80,7 @@ class InProcessCell:
         self._frames: tuple[np.ndarray, np.ndarray] | None = None
         self._seen: Look | None = None  # what perception made of them
         self._poses: dict[tuple[int, int], tuple[Any, np.ndarray]] = {}
+        self._centroids: list[np.ndarray] = []  # of the objects of the newest plan, base_link
 
     def load(self, scene: str, seed: int) -> int:
         """Measures the bare table, then sets up the scene; returns the number of parts."""
@@ -127,7 +128,7 @@ class InProcessCell:
         ranking = rank(look.objects, intrinsics, self._priority, failed, seed)
         heights = self._core.HeightMap(look.depth, k, camera.T_base_color, self.simulated.config)
         self._pick_and_place.set_heights(heights)
-        self._poses = {}
+        self._poses, self._centroids = {}, []
         targets = [self._target(ranked, intrinsics, camera, heights) for ranked in ranking.objects]
         targets += [
             Target(scene_id, o.object_id, o.label, o.score, 0.0, None, False, reason)
@@ -145,6 +146,7 @@ class InProcessCell:
                 candidate.centroid_u_px, candidate.centroid_v_px, candidate.centroid_depth_m
             )
             centroid = camera.T_base_color[:3, :3] @ point + camera.T_base_color[:3, 3]
+            self._centroids.append(centroid)
         pose = self._core.best_grasp_pose(
             [core_rectangle(self._core, grasp) for grasp in candidate.grasps],
             camera.color,
@@ -181,15 +183,19 @@ class InProcessCell:
             pose, centroid = self._poses[target.scene_id, target.object_id]
         except KeyError:
             return Outcome(False, "unknown_grasp", "the target is not of the newest look")
-        result = self._pick_and_place.run(self._robot, pose, centroid, tray_slot)
+        return self._came_back(self._pick_and_place.run(self._robot, pose, centroid, tray_slot))
+
+    def push(self, scene_id: int) -> Outcome:
+        return self._came_back(self._pick_and_place.push(self._robot, self._centroids))
+
+    def _came_back(self, result: Any) -> Outcome:
+        """What came of a motion, the arm being back at its observing pose."""
         reason = result.reason.name.lower()
-        outcome = Outcome(
-            reason == "succeeded", "" if reason == "succeeded" else reason, result.message
-        )
         back = self._pick_and_place.observe(self._robot)
         if back.reason.name != "SUCCEEDED":
             raise CellError(f"the arm cannot return to its observing pose: {back.message}")
-        return outcome
+        done = reason == "succeeded"
+        return Outcome(done, "" if done else reason, result.message)
 
     def time(self) -> float:
         return self.simulated.time

@@ -61,6 +61,7 @@ class Trial:
             "collisions": verdict.get("collisions", []),
             "picks": [pick_entry(a, self.verdict) for a in self.cycle.attempts],
             "looks": self.cycle.looks,
+            "pushes": self.cycle.pushes,
             "ended": "error" if self.error else self.cycle.ended,
             "error": self.error,
             "sim_time_s": round(self.sim_time_s, 3),
@@ -162,6 +163,9 @@ class _Timed:
 
     def execute(self, target, tray_slot):
         return self._cell.execute(target, tray_slot)
+
+    def push(self, scene_id):
+        return self._cell.push(scene_id)
 
     def time(self):
         return self._cell.time()

@@ -22,6 +22,8 @@ from iwgnet_grasp.msg import (
     PickPlaceAction,
     PickPlaceGoal,
     PickPlaceResult,
+    PushAction,
+    PushGoal,
     Scene,
     SceneGrasps,
     Topics,
@@ -115,6 +117,7 @@ class RosCell:
             + (((Topics.SCENE, Scene),) if on_plan else ())
         }
         self._pick_place = actionlib.ActionClient(Topics.PICK_PLACE, PickPlaceAction)
+        self._push = actionlib.ActionClient(Topics.PUSH, PushAction)
 
     def wait_until_ready(self, seconds: float = 300.0) -> None:
         """Waits until every node is up and connected. Raises CellError naming what is missing."""
@@ -134,8 +137,9 @@ class RosCell:
                     master.lookupService(service)
                 except rosgraph.MasterError:
                     return f"nobody offers {service}"
-            if not self._pick_place.wait_for_server(rospy.Duration(0.01)):
-                return f"no action server on {Topics.PICK_PLACE}"
+            for name, client in ((Topics.PICK_PLACE, self._pick_place), (Topics.PUSH, self._push)):
+                if not client.wait_for_server(rospy.Duration(0.01)):
+                    return f"no action server on {name}"
             if self._simulated and rospy.get_time() == 0.0:
                 return "/clock does not tick"
             return ""
@@ -258,25 +262,31 @@ class RosCell:
     def execute(self, target: Target, tray_slot: int) -> Outcome:
         seen, planned = self._planned
         scene_id = planned if target.scene_id == seen else target.scene_id
-        goal = Goal(
-            self._pick_place,
-            PickPlaceGoal(scene_id=scene_id, object_id=target.object_id, tray_slot=tray_slot),
-            self._notify,
-        )
-        try:
-            self._wait(goal.done.is_set, 600.0, lambda: f"no result from {Topics.PICK_PLACE}")
-        except BaseException:  # ctrl-C too: the arm must not go on by itself
-            goal.cancel()
-            raise
-        result = goal.result
-        if result is None:
-            raise CellError(f"{Topics.PICK_PLACE} ended without a result; see motion_control's log")
+        goal = PickPlaceGoal(scene_id=scene_id, object_id=target.object_id, tray_slot=tray_slot)
+        result = self._move(self._pick_place, Topics.PICK_PLACE, goal)
         reason = "" if result.success else _REASONS.get(result.reason, str(result.reason))
-        outcome = Outcome(result.success, reason, result.message)
+        return Outcome(result.success, reason, result.message)
+
+    def push(self, scene_id: int) -> Outcome:
+        seen, planned = self._planned
+        goal = PushGoal(scene_id=planned if scene_id == seen else scene_id)
+        result = self._move(self._push, Topics.PUSH, goal)
+        return Outcome(result.success, "" if result.success else "not_pushed", result.message)
+
+    def _move(self, client: Any, name: str, goal: Any) -> Any:
+        """The result of a motion, the arm being back at its observing pose."""
+        handle = Goal(client, goal, self._notify)
+        try:
+            self._wait(handle.done.is_set, 600.0, lambda: f"no result from {name}")
+        except BaseException:  # ctrl-C too: the arm must not go on by itself
+            handle.cancel()
+            raise
+        if handle.result is None:
+            raise CellError(f"{name} ended without a result; see motion_control's log")
         back = self._call(Topics.OBSERVE, std_srvs.srv.Trigger, None, 180.0)
         if not back.success:
             raise CellError(f"the arm cannot return to its observing pose: {back.message}")
-        return outcome
+        return handle.result
 
     def time(self) -> float:
         return rospy.get_time()

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from iwgnet_grasp.overrides import changed_config
 from iwgnet_grasp.supervisor import CellError
-from iwgnet_grasp.trials.overrides import changed_config
 from iwgnet_grasp.trials.pool import Worker
 from iwgnet_grasp.trials.statistics import Record
 

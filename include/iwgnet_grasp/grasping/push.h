@@ -1,0 +1,33 @@
+// Pushes that change how a pile lies where nothing can be grasped well.
+#pragma once
+
+#include <vector>
+
+#include "iwgnet_grasp/core/cell_config.h"
+#include "iwgnet_grasp/grasping/height_map.h"
+
+namespace iwgnet_grasp::grasping {
+
+struct PushConfig {       // config/motion.yaml, section "push"
+  double gap;             // m between the pads while pushing
+  double tip_height;      // m, finger tips over the table
+  double clearance;       // m, tips over whatever lies where they go down
+  double run_up;          // m from the object's centroid at most, to where they go down
+  double distance;        // m that the fingers go on once they meet something
+  double margin;          // m, the object's centroid stays so far inside the workspace
+  double speed;           // m/s of the tool
+};
+
+// The tips go down at `from`, closing direction across the way, and move straight to `to`.
+struct Push {
+  Eigen::Vector2d from, to;  // m, base_link
+};
+
+// All pushes against the objects (centroids in base_link, m): from a place where the fingers find
+// room, nearest to the object in each of 16 directions, through what is not so high that the
+// gripper's body would touch it, not out of the workspace. Those with the least in their way first:
+// an object moves away from its neighbours rather than into them.
+std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
+                              const CellConfig& cell, const PushConfig& config);
+
+}  // namespace iwgnet_grasp::grasping

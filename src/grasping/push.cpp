@@ -1,0 +1,71 @@
+#include "iwgnet_grasp/grasping/push.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace iwgnet_grasp::grasping {
+namespace {
+
+constexpr int kDirections = 16;
+constexpr double kStep = 0.002;  // m
+// Half extents (m) along and across the closing direction, nearly closed; above_tips: of the
+// undersides (grasping.yaml: finger_outline, finger_bodies, palm).
+const Eigen::Vector2d kTips(0.013, 0.013), kFingers(0.040, 0.024), kBody(0.048, 0.042);
+constexpr double kFingersAbove = 0.035, kBodyAbove = 0.060;
+constexpr double kAhead = 0.08;      // m beyond the push's end that count as in its way
+constexpr double kHalfWidth = 0.03;  // m of what counts
+
+}  // namespace
+
+std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
+                              const CellConfig& cell, const PushConfig& config) {
+  struct Candidate {
+    Push push;
+    double in_the_way;  // m, mean height
+  };
+  std::vector<Candidate> candidates;
+  const Eigen::Vector2d low = cell.workspace_min.array() + config.margin,
+                        high = cell.workspace_max.array() - config.margin;
+  for (const Eigen::Vector3d& object : objects)
+    for (int i = 0; i < kDirections; ++i) {
+      const double angle = 2 * M_PI * i / kDirections, closing = angle + M_PI / 2;
+      const Eigen::Vector2d along(std::cos(angle), std::sin(angle)), center = object.head<2>();
+      const auto free = [&](const Eigen::Vector2d& p, const Eigen::Vector2d& half, double underside) {
+        return heights.max_in(p, closing, half) + config.clearance <= config.tip_height + underside;
+      };
+      double back = kTips.y();
+      while (back <= config.run_up &&
+             !(free(center - back * along, kTips, 0.0) &&
+               free(center - back * along, kFingers, kFingersAbove)))
+        back += kStep;
+      if (back > config.run_up) continue;
+      // The tips meet something before they are over the centroid.
+      const Eigen::Vector2d from = center - back * along;
+      double way = 0.0;
+      while (way < back && free(from + way * along, kTips, 0.0)) way += kStep;
+      way += config.distance;
+      const Push push{from, from + way * along};
+      const Eigen::Vector2d ends = center + config.distance * along;
+      if ((ends.array() < low.array()).any() || (ends.array() > high.array()).any()) continue;
+      bool passes = true;
+      for (double s = 0.0; passes && s <= way; s += 5 * kStep)
+        passes = free(push.from + s * along, kBody, kBodyAbove);
+      if (!passes) continue;
+      double sum = 0.0;
+      int cells = 0;
+      for (double s = 0.0; s <= way + kAhead; s += 2 * kStep)
+        for (double t = -kHalfWidth; t <= kHalfWidth; t += 2 * kStep, ++cells) {
+          const Eigen::Vector2d p = push.from + s * along + t * Eigen::Vector2d(-along.y(), along.x());
+          sum += heights.at(p.x(), p.y());
+        }
+      candidates.push_back({push, sum / cells});
+    }
+  std::stable_sort(candidates.begin(), candidates.end(), [](const auto& a, const auto& b) {
+    return a.in_the_way < b.in_the_way;
+  });
+  std::vector<Push> pushes;
+  for (const Candidate& candidate : candidates) pushes.push_back(candidate.push);
+  return pushes;
+}
+
+}  // namespace iwgnet_grasp::grasping
