@@ -151,6 +151,22 @@ class PerceptionConfig:
         )
 
 
+@dataclass(frozen=True)
+class _View:
+    """What the networks see of the table; (H, W) each but color."""
+
+    color: np.ndarray  # (H, W, 3) uint8 RGB
+    depth: np.ndarray  # m
+    empty_depth: np.ndarray
+    grey: np.ndarray  # uint8
+    heights: np.ndarray  # m over the empty scene, lines of missing pixels filled
+
+    @staticmethod
+    def of(color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> _View:
+        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+        return _View(color, depth, empty_depth, grey, without_gaps(empty_depth - depth))
+
+
 class Perception:
     """All networks on one look. Stateless between looks."""
 
@@ -195,10 +211,11 @@ class Perception:
                     f"{name}: {image.shape[1]}x{image.shape[0]} px differs from the colour image's "
                     f"{color.shape[1]}x{color.shape[0]} px; align it to the colour camera"
                 )
+        view = _View.of(color, depth, empty_depth)
         checked = time.perf_counter()
         detections = self.detector.detect(color)
         detected = time.perf_counter()
-        detections, owners = self._distinct(color, depth, empty_depth, detections)
+        detections, owners = self._distinct(view, detections)
         masked = time.perf_counter()
         numbered = dict(enumerate(detections))
         seconds = {
@@ -206,7 +223,7 @@ class Perception:
             "detect": detected - checked,
             "mask": masked - detected,
         }
-        return self._estimate(color, depth, empty_depth, numbered, owners, seconds, strict=False)
+        return self._estimate(view, numbered, owners, seconds, strict=False)
 
     def without(self, look: Look, taken: Sequence[int]) -> Look:
         """The look as it would be once the objects with these ids had been taken away and nothing
@@ -214,36 +231,32 @@ class Perception:
         stay, their grasps are estimated anew. What the taken ones hide is not known.
         """
         depth = taken_away(look.depth, look.empty_depth, look.owners, taken)
+        view = _View.of(look.color, depth, look.empty_depth)
         left = {
             o.object_id: Detection(o.label, o.score, o.box)
             for o in look.objects
             if o.object_id not in taken
         }
         owners = np.where(np.isin(look.owners, list(taken)), NOBODY, look.owners)
-        return self._estimate(look.color, depth, look.empty_depth, left, owners, {}, strict=True)
+        return self._estimate(view, left, owners, {}, strict=True)
 
     def _distinct(
-        self,
-        color: np.ndarray,
-        depth: np.ndarray,
-        empty_depth: np.ndarray,
-        detections: Sequence[Detection],
+        self, view: _View, detections: Sequence[Detection]
     ) -> tuple[list[Detection], np.ndarray]:
         """The detections that show an object of their own, with a score of 0 what stands there and
         no detection explains, and whose pixel each is."""
         config = self.config
         size = self.masks.input_px
         boxes = [detection.box for detection in detections]
-        windows = [crop_window(depth, empty_depth, box, size) for box in boxes]
+        windows = [crop_window(view.depth, view.empty_depth, box, size) for box in boxes]
         heights = np.zeros((len(windows), size, size), np.float32)
         for height, window in zip(heights, windows, strict=True):
             with contextlib.suppress(ValueError):  # nothing measured: the brightness alone tells
                 height[:] = normalise_depth(window.depth, window.empty)
-        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        greys = [grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
+        greys = [view.grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
         logits = self.masks.predict(heights, np.array(greys, np.uint8).reshape(heights.shape))
         with np.errstate(invalid="ignore"):
-            seen = without_gaps(empty_depth - depth) > config.min_height
+            seen = view.heights > config.min_height
         kept = distinct_objects(
             logits,
             windows,
@@ -255,10 +268,10 @@ class Perception:
         )
         detections = [detections[i] for i in kept]
         owners = pixel_owners(
-            logits[kept], [windows[i] for i in kept], [d.box for d in detections], depth.shape
+            logits[kept], [windows[i] for i in kept], [d.box for d in detections], seen.shape
         )
-        x1, x2 = (round(depth.shape[1] * part) for part in self.detector.region[::2])
-        y1, y2 = (round(depth.shape[0] * part) for part in self.detector.region[1::2])
+        x1, x2 = (round(seen.shape[1] * part) for part in self.detector.region[::2])
+        y1, y2 = (round(seen.shape[0] * part) for part in self.detector.region[1::2])
         looked_at = np.zeros_like(seen)
         looked_at[y1:y2, x1:x2] = seen[y1:y2, x1:x2]
         label = detections[0].label if detections else UNKNOWN
@@ -269,9 +282,7 @@ class Perception:
 
     def _estimate(
         self,
-        color: np.ndarray,
-        depth: np.ndarray,
-        empty_depth: np.ndarray,
+        view: _View,
         detections: dict[int, Detection],
         owners: np.ndarray,
         seconds: dict[str, float],
@@ -282,7 +293,7 @@ class Perception:
         start = time.perf_counter()
         size = self.estimator.input_px
         boxes = [detection.box for detection in detections.values()]
-        windows = tuple(crop_window(depth, empty_depth, box, size) for box in boxes)
+        windows = tuple(crop_window(view.depth, view.empty_depth, box, size) for box in boxes)
         estimates: list[list[Any]] = []
         if windows:
             estimates = self.estimator.predict(
@@ -290,13 +301,13 @@ class Perception:
             )
         estimated = time.perf_counter()
         objects = tuple(
-            self._object(i, detection, window, grasps, depth, empty_depth, owners, strict)
+            self._object(i, detection, window, grasps, view.depth, view.empty_depth, owners, strict)
             for (i, detection), window, grasps in zip(
                 detections.items(), windows, estimates, strict=True
             )
         )
         decoded = time.perf_counter()
-        objects = self._foreseen(objects, color, depth, empty_depth, owners)
+        objects = self._foreseen(objects, view, owners)
         end = time.perf_counter()
         seconds = seconds | {
             "grasp": estimated - start,
@@ -304,24 +315,19 @@ class Perception:
             "foresee": end - decoded,
         }
         seconds["total"] = sum(seconds.values())
-        return Look(color, depth, empty_depth, objects, windows, owners, seconds)
+        return Look(view.color, view.depth, view.empty_depth, objects, windows, owners, seconds)
 
     def _foreseen(
-        self,
-        objects: tuple[ObjectGrasps, ...],
-        color: np.ndarray,
-        depth: np.ndarray,
-        empty_depth: np.ndarray,
-        owners: np.ndarray,
+        self, objects: tuple[ObjectGrasps, ...], view: _View, owners: np.ndarray
     ) -> tuple[ObjectGrasps, ...]:
         """The objects with their grasps' quality times the probability that no other part
         moves; best first."""
-        heights = without_gaps(empty_depth - depth)
-        grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         pairs = [(o, grasp) for o in objects for grasp in o.grasps]
         if not pairs:
             return objects
-        views = [grasp_view(heights, grey, owners, o.object_id, grasp) for o, grasp in pairs]
+        views = [
+            grasp_view(view.heights, view.grey, owners, o.object_id, grasp) for o, grasp in pairs
+        ]
         outcomes = self.outcomes.predict(np.stack(views))
         grasps: dict[int, list[GraspRectangle]] = {o.object_id: [] for o in objects}
         for (o, grasp), (_, still) in zip(pairs, outcomes, strict=True):

@@ -93,6 +93,7 @@ def summarise(records: Sequence[Record]) -> dict:
         "interval_95": list(wilson_interval(successes, trials)),
         "attempts": len(picks),
         "good_attempts": len(good),
+        "pushes": sum(record.get("pushes", 0) for record in records),
         "gsr": _ratio(len(good), len(picks)),
         "gsr_interval_95": list(wilson_interval(len(good), len(picks))),
         "objects": objects,

@@ -12,8 +12,17 @@ Rows = list[list[str]]
 
 def success_rows(summary: dict) -> tuple[list[str], Rows]:
     """Head and rows: a scene a row, the paper's figure beside ours."""
-    head = ["scene", "success", "rate", "95 % interval", "paper", "attempts", "GSR", "cleared"]
-    head += ["picks/h", "slip mm", "slip deg", "placement mm", "simulated s", "wall s", "x real"]
+    head = ["scene", "success", "rate", "95 % interval", "paper", "attempts", "GSR", "pushes"]
+    head += [
+        "cleared",
+        "picks/h",
+        "slip mm",
+        "slip deg",
+        "placement mm",
+        "simulated s",
+        "wall s",
+        "x real",
+    ]
     rows = []
     for scene, s in summary["scenes"].items():
         paper = PAPER_SUCCESSES.get(scene)
@@ -147,6 +156,7 @@ def _speed_and_care(s: dict) -> list[str]:
     return [
         f"{s['good_attempts']}/{s['attempts']}",
         percent(s["gsr"]),
+        str(s.get("pushes", 0)),  # none in the summary of an older run
         percent(s["cleared"]),
         number(s["picks_per_hour"]),
         spread(s["slip_mm"]),
