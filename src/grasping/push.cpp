@@ -39,18 +39,18 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
                free(center - back * along, kFingers, kFingersAbove)))
         back += kStep;
       if (back > config.run_up) continue;
-      // The tips meet something before they are over the centroid.
       const Eigen::Vector2d from = center - back * along;
-      double way = 0.0;
-      while (way < back && free(from + way * along, kTips, 0.0)) way += kStep;
-      way += config.distance;
+      double met = 0.0;  // m, at the centroid at the latest
+      while (met < back && free(from + met * along, kTips, 0.0)) met += kStep;
+      double way = met;
+      const auto goes_on = [&] {
+        const Eigen::Vector2d end = center + (way - met + kStep) * along;
+        return (end.array() >= low.array()).all() && (end.array() <= high.array()).all() &&
+               free(from + (way + kStep) * along, kBody, kBodyAbove);
+      };
+      while (way - met < config.distance && goes_on()) way += kStep;
+      if (way - met < config.min_distance || !free(from, kBody, kBodyAbove)) continue;
       const Push push{from, from + way * along};
-      const Eigen::Vector2d ends = center + config.distance * along;
-      if ((ends.array() < low.array()).any() || (ends.array() > high.array()).any()) continue;
-      bool passes = true;
-      for (double s = 0.0; passes && s <= way; s += 5 * kStep)
-        passes = free(push.from + s * along, kBody, kBodyAbove);
-      if (!passes) continue;
       double sum = 0.0;
       int cells = 0;
       for (double s = 0.0; s <= way + kAhead; s += 2 * kStep)

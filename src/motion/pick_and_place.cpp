@@ -180,6 +180,7 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.push.clearance = positive("push.clearance");
   config.push.run_up = positive("push.run_up");
   config.push.distance = positive("push.distance");
+  config.push.min_distance = positive("push.min_distance");
   config.push.margin = positive("push.margin");
   config.push.speed = positive("push.speed");
   if (config.push.gap < config.held_gap_min)

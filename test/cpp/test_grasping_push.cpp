@@ -39,7 +39,7 @@ TEST(Push, GoesAgainstTheObjectFromFreePlacesAndMovesItByTheDistance) {
     EXPECT_NEAR(from.x() * way.y() - from.y() * way.x(), 0.0, 1e-6);
     EXPECT_LT(from.dot(way), 0.0);
     EXPECT_GE(way.norm(), table.config.distance - 1e-9);
-    EXPECT_LE(way.norm(), table.config.distance + 0.045);  // up to the wider fingers above the tips
+    EXPECT_LE(way.norm(), table.config.distance + 0.045);  // from outside of the wider upper fingers
   }
 }
 

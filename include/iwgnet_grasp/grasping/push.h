@@ -13,7 +13,8 @@ struct PushConfig {       // config/motion.yaml, section "push"
   double tip_height;      // m, finger tips over the table
   double clearance;       // m, tips over whatever lies where they go down
   double run_up;          // m from the object's centroid at most, to where they go down
-  double distance;        // m that the fingers go on once they meet something
+  double distance, min_distance;  // m that the fingers go on once they meet something, as far as the
+                                  // workspace lets them, and what is worth it
   double margin;          // m, the object's centroid stays so far inside the workspace
   double speed;           // m/s of the tool
 };
@@ -24,8 +25,8 @@ struct Push {
 };
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
-// room, nearest to the object in each of 16 directions, through what is not so high that the
-// gripper's body would touch it, not out of the workspace. Those with the least in their way first:
+// room, nearest to the object in each of 16 directions, as far as what is there is not so high that
+// the gripper's body would touch it and the object stays in the workspace. Those with the least in their way first:
 // an object moves away from its neighbours rather than into them.
 std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
                               const CellConfig& cell, const PushConfig& config);
