@@ -32,6 +32,7 @@ from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_jacquard
 from iwgnet_grasp.data.lift_check import plan_check, require_stored, summary
+from iwgnet_grasp.data.mask_dataset import find_masks, load_mask_views
 from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -127,6 +128,13 @@ def test_boxes_are_those_of_their_masks(dataset):
         mask = coco_mask.decode(entry["segmentation"])
         assert mask.sum() == entry["area"]
         assert list(bounding_box(mask > 0)) == entry["bbox"]
+
+
+def test_every_part_in_sight_has_its_mask_and_only_those_with_grasps_are_samples(dataset):
+    text = json.loads((dataset / "detector" / "annotations.json").read_text())
+    seen = sorted(f"{a['part']}_{a['image_id']:06d}" for a in text["annotations"])
+    assert sorted(stem.name for stem in find_masks(dataset)) == seen
+    assert len(load_mask_views([dataset])) == len(seen) >= len(find_jacquard(dataset)) > 0
 
 
 def test_other_projects_loaders_find_what_they_expect(dataset):
@@ -297,6 +305,17 @@ def test_a_mesh_of_ones_own_is_labelled_like_any_part(tmp_path):
 def test_a_folder_with_another_set_is_refused(dataset):
     with pytest.raises(DataError, match="another"):
         generate_dataset(SCENES, SEED + 1, dataset, ["connecting_rod"], 1, quiet=True)
+
+
+def test_settings_can_be_changed_by_name_and_make_another_set(dataset, tmp_path):
+    few = ["scene.parts=[2, 2]", "scene.scattered_share=1.0"]
+    generate_dataset(1, SEED, tmp_path, ["connecting_rod"], 1, quiet=True, changes=few)
+    made = json.loads((tmp_path / "dataset.json").read_text())
+    assert made["settings"]["scene"]["parts"] == [2, 2]
+    with pytest.raises(DataError, match="another seed, families, parts or settings"):
+        generate_dataset(1, SEED, tmp_path, ["connecting_rod"], 1, quiet=True)
+    with pytest.raises(DataError, match="did you mean 'parts'"):
+        generate_dataset(1, SEED, tmp_path / "x", ["connecting_rod"], 1, changes=["scene.party=3"])
 
 
 def test_an_unknown_family_is_named_with_the_known_ones(tmp_path):

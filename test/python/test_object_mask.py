@@ -87,6 +87,20 @@ def test_an_augmented_window_keeps_image_and_mask_together(tmp_path):
         assert torch.equal(again[0][0], height) and torch.equal(again[1], mask)
 
 
+def test_upright_boxes_stay_upright_where_only_quarter_turns_are_made(tmp_path):
+    from iwgnet_grasp.data.augmentation import Augmentation
+
+    views = load_mask_views([write_set(tmp_path, 1)])
+    change = Augmentation(noise=0, tilt=0, holes=0, any_turn=False)
+    shapes = set()
+    for seed in range(12):
+        _, mask = MaskDataset(views, INPUT_PX, change, (seed,))[0]
+        x, y, width, height = cv2.boundingRect(mask.numpy().astype(np.uint8))
+        assert mask[y : y + height, x : x + width].mean() > 0.97  # the bar fills its box
+        shapes.add(width > height)
+    assert shapes == {True, False}
+
+
 def test_training_learns_bars_goes_on_after_a_stop_and_says_how_it_was_made(tmp_path):
     train, val = write_set(tmp_path / "train", 24), write_set(tmp_path / "val", 4)
     settings = MaskTrainingSettings(epochs=8, batch=4)

@@ -22,6 +22,9 @@ from iwgnet_grasp.msg import (
     PickPlaceAction,
     PickPlaceGoal,
     PickPlaceResult,
+    PushAction,
+    PushGoal,
+    PushResult,
     Scene,
     SceneGrasps,
     Topics,
@@ -64,7 +67,9 @@ class Graph:
         self.grasps = rospy.Publisher(Topics.GRASPS, SceneGrasps, queue_size=1, latch=True)
         self.failed = rospy.Publisher(Topics.FAILED_GRASPS, FailedGrasps, queue_size=1, latch=True)
         self.pick_place = actionlib.ActionClient(Topics.PICK_PLACE, PickPlaceAction)
+        self.pushing = actionlib.ActionClient(Topics.PUSH, PushAction)
         assert self.pick_place.wait_for_server(rospy.Duration(60))
+        assert self.pushing.wait_for_server(rospy.Duration(60))
         for service in (Topics.CAPTURE, Topics.LOAD_SCENE, Topics.OBSERVE):
             rospy.wait_for_service(service, 60)
         self.capture = rospy.ServiceProxy(Topics.CAPTURE, Capture)
@@ -81,6 +86,11 @@ class Graph:
 
     def pick(self, scene_id, object_id, slot=0) -> PickPlaceResult:
         goal = Goal(self.pick_place, PickPlaceGoal(scene_id, object_id, slot))
+        assert goal.done.wait(60), "no result"
+        return goal.result
+
+    def push(self, scene_id) -> PushResult:
+        goal = Goal(self.pushing, PushGoal(scene_id))
         assert goal.done.wait(60), "no result"
         return goal.result
 
@@ -188,6 +198,25 @@ def test_a_goal_of_another_scene_is_refused(nodes):
     result = nodes.pick(scene_id=10_000, object_id=0)
     assert (result.success, result.reason) == (False, PickPlaceResult.UNKNOWN_GRASP)
     assert "10000" in result.message
+
+
+def test_an_object_is_pushed_aside_and_not_gripped(nodes):
+    refused = nodes.push(scene_id=10_000)
+    assert not refused.success and "10000" in refused.message
+    before = nodes.look()
+    nodes.grasps.publish(objects_by_depth(before))
+    nodes.poses.wait(lambda m: m.scene_id == before.scene_id)
+    result = nodes.push(before.scene_id)
+    assert result.success, result.message
+    verdict = json.loads(rospy.ServiceProxy(Topics.JUDGE, Judge)().verdict_json)
+    assert verdict["picks"] == [] and verdict["collisions"] == [] and verdict["on_table"] == 5
+    answer = nodes.capture(empty_scene=False)
+    after = nodes.scene.wait(lambda m: m.scene_id == answer.scene_id)
+    depths = [image_array(m.depth, "depth") for m in (before, after)]
+    with np.errstate(invalid="ignore"):
+        moved = np.abs(depths[0] - depths[1]) > 0.01
+    assert np.count_nonzero(moved) > 1500  # where a rod lay, and where it lies now
+    nodes.failed.publish(FailedGrasps())
 
 
 def test_unreachable_and_infeasible_grasps_are_refused_and_the_node_goes_on(nodes):

@@ -10,7 +10,7 @@ from iwgnet_grasp.data.grasp_rectangle import transform
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Any rotation and mirroring, and up to the amounts below; heights in network units."""
+    """Rotation and mirroring, and up to the amounts below; heights in network units."""
 
     zoom: float = 0.12  # largest relative change of size
     shift_px: float = 8.0
@@ -18,6 +18,7 @@ class Augmentation:
     tilt: float = 0.05  # largest height of a tilted table at the border
     holes: int = 4  # most patches whose depth is lost and filled from around
     hole_px: int = 10
+    any_turn: bool = True  # else quarters of a turn: an upright box stays one
 
     def __call__(
         self, height: np.ndarray, rectangles: np.ndarray, size: int, rng: np.random.Generator
@@ -31,6 +32,8 @@ class Augmentation:
     def similarity(self, shape: tuple[int, int], size: int, rng: np.random.Generator) -> np.ndarray:
         """(2, 3) px of an image of this shape -> px of a random crop [size, size]."""
         angle = rng.uniform(0, 2 * np.pi)
+        if not self.any_turn:
+            angle = np.floor(angle / (np.pi / 2)) * np.pi / 2
         zoom = np.exp(rng.uniform(-1, 1) * np.log1p(self.zoom))
         linear = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         if rng.random() < 0.5:

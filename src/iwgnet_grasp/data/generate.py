@@ -327,17 +327,17 @@ def encode_scene(scene: Scene, number: int, categories: list[str]) -> dict[str, 
         files[f"detector/images/{number:06d}.png"] = png(scene.color[:, :, ::-1])
     for o in scene.objects:
         window, rows = crop(scene, o)
-        if len(rows) == 0:
-            continue  # a part that nothing can be done with: the detector's business only
-        perfect = crop_window(scene.ideal, scene.empty_ideal, o.detected, CROP_PX)
         cut = slice(window.y, window.y + CROP_PX), slice(window.x, window.x + CROP_PX)
-        quality = "".join(f"{max(q, 1e-4):.4f}\n" for q in rows[:, QUALITY])
         stem = f"{number:06d}/{o.part}_{number:06d}"
         if scene.color is not None:
             files[f"{stem}_RGB.png"] = png(scene.color[cut][:, :, ::-1])
-        files[f"{stem}_perfect_depth.tiff"] = tiff(perfect.depth)
         files[f"{stem}_stereo_depth.tiff"] = tiff(window.depth)
         files[f"{stem}_mask.png"] = png(o.mask[cut].astype(np.uint8) * 255)
+        if len(rows) == 0:
+            continue  # readers of Jacquard's layout go by grasps.txt
+        perfect = crop_window(scene.ideal, scene.empty_ideal, o.detected, CROP_PX)
+        quality = "".join(f"{max(q, 1e-4):.4f}\n" for q in rows[:, QUALITY])
+        files[f"{stem}_perfect_depth.tiff"] = tiff(perfect.depth)
         files[f"{stem}_grasps.txt"] = format_grasps(rows).encode()
         files[f"{stem}_quality.txt"] = quality.encode()
     height, width = scene.ideal.shape

@@ -16,7 +16,6 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.images import read_depth
-from iwgnet_grasp.data.jacquard import find_jacquard
 from iwgnet_grasp.networks.object_mask import normalise_grey
 
 log = logging.getLogger(__name__)
@@ -34,6 +33,13 @@ class MaskViews:
         return len(self.heights)
 
 
+def find_masks(folder: Path) -> list[Path]:
+    """What the names of the files of each object of a set begin with, also of those that nothing
+    can grasp."""
+    ending = "_mask.png"
+    return [f.with_name(f.name.removesuffix(ending)) for f in sorted(folder.rglob(f"*{ending}"))]
+
+
 def load_mask_views(
     folders: Iterable[Path], progress: Callable[[], None] = lambda: None
 ) -> MaskViews:
@@ -41,11 +47,11 @@ def load_mask_views(
     a set made with --no-detector has no colour images."""
     heights, greys, masks = [], [], []
     for folder in folders:
-        for sample in find_jacquard(folder):
+        for stem in find_masks(folder):
             try:
-                depth = read_depth(Path(f"{sample.stem}_stereo_depth.tiff"))
-                grey = _grey(Path(f"{sample.stem}_RGB.png"), depth.shape)
-                mask = _grey(Path(f"{sample.stem}_mask.png"), depth.shape) > 0
+                depth = read_depth(Path(f"{stem}_stereo_depth.tiff"))
+                grey = _grey(Path(f"{stem}_RGB.png"), depth.shape)
+                mask = _grey(Path(f"{stem}_mask.png"), depth.shape) > 0
                 height = normalise_depth(depth).astype(np.float16)
             except (DataError, ValueError) as error:
                 log.warning("%s", error)

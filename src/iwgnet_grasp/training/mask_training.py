@@ -12,13 +12,14 @@ from torch.utils.data import DataLoader
 
 from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.data.jacquard import find_jacquard
-from iwgnet_grasp.data.mask_dataset import MaskDataset, MaskViews, load_mask_views
+from iwgnet_grasp.data.mask_dataset import MaskDataset, MaskViews, find_masks, load_mask_views
 from iwgnet_grasp.networks import count_parameters
 from iwgnet_grasp.networks.object_mask import INPUT_PX, NAME, ObjectMask, mask_loss
 from iwgnet_grasp.networks.weights import load_state, save_weights, weights_path
 from iwgnet_grasp.training.card import describe_set
 from iwgnet_grasp.training.fitting import SmallTraining, fit, prepare
+
+AUGMENTATION = Augmentation(any_turn=False)  # which object is meant is told by its upright box
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class MaskTraining(SmallTraining):
         self.views, self.held_out = training, validation
 
     def train_dataloader(self) -> DataLoader:
-        return self.shuffled(lambda seed: MaskDataset(self.views, INPUT_PX, Augmentation(), seed))
+        return self.shuffled(lambda seed: MaskDataset(self.views, INPUT_PX, AUGMENTATION, seed))
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(MaskDataset(self.held_out, INPUT_PX), self.settings.batch)
@@ -90,7 +91,7 @@ def train_mask_network(
     if missing:
         raise DataError(f"{missing[0]}: no such folder; make a set with 'iwgnet dataset'")
     with Progress(transient=True) as bar:
-        total = sum(len(find_jacquard(folder)) for folder in folders)
+        total = sum(len(find_masks(folder)) for folder in folders)
         task = bar.add_task("reading samples", total=total)
         training = load_mask_views(data, lambda: bar.advance(task))
         validation = load_mask_views([validation_data], lambda: bar.advance(task))
@@ -109,7 +110,7 @@ def train_mask_network(
             "validation_samples": len(validation),
         },
         "training": asdict(settings) | ({"initial": initial} if initial else {}),
-        "augmentation": asdict(Augmentation()),
+        "augmentation": asdict(AUGMENTATION),
         "validation": {key: round(scores[f"val/{key}"], 4) for key in ("loss", "iou")},
         "torch": torch.__version__,
     }
