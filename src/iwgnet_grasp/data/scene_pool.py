@@ -112,6 +112,7 @@ class ProcessPool:
 
     def __init__(self, size: int, kind: SceneKind, package_dir: Path) -> None:
         self.size = size
+        self._others = set(multiprocessing.active_children())
         self._pool = ProcessPoolExecutor(
             size,
             mp_context=multiprocessing.get_context("spawn"),
@@ -134,6 +135,9 @@ class ProcessPool:
             raise DataError(_DIED) from None
 
     def close(self) -> None:
+        """What is under way is lost: a pile takes up to a minute, and who stops a run waits."""
+        for process in set(multiprocessing.active_children()) - self._others:
+            process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
