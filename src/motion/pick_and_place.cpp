@@ -25,6 +25,7 @@ constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more u
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
 constexpr double kLengthwise = 0.035;    // m between the pads: a part held by less is not held lengthwise
+constexpr double kSameDirection = 0.6;   // cosine, 53 deg: a push's, or the opposite one
 constexpr int kCombinations = 8;         // of grasp and slot configurations to plan for, best first
 
 double seconds_since(Clock::time_point start) {
@@ -491,8 +492,18 @@ PickResult PickAndPlace::push(Robot& robot, const std::vector<Eigen::Vector3d>& 
   result.message = "no room for the fingers to push from";
   Trajectory approach, sweep;
   const JointVector start = start_of(robot);
-  for (const grasping::Push& push : grasping::find_pushes(heights_, objects, cell_, config_.push)) {
+  const auto direction = [](const grasping::Push& push) {
+    return Eigen::Vector2d((push.to - push.from).normalized());
+  };
+  auto pushes = grasping::find_pushes(heights_, objects, cell_, config_.push);
+  std::stable_partition(pushes.begin(), pushes.end(), [&](const grasping::Push& push) {
+    return std::none_of(pushed_.begin(), pushed_.end(), [&](const Eigen::Vector2d& before) {
+      return std::abs(direction(push).dot(before)) > kSameDirection;
+    });
+  });
+  for (const grasping::Push& push : pushes) {
     if (!plan_push(start, push, approach, sweep, result.message)) continue;
+    pushed_.push_back(direction(push));
     result.reason = PickReason::kSucceeded;
     result.message.clear();
     break;
@@ -585,6 +596,7 @@ void PickAndPlace::put_back(Robot& robot, const PickPlan& plan, double opening) 
 
 PickResult PickAndPlace::run(Robot& robot, const PickRequest& request,
                              const std::function<bool(const std::string&)>& phase) {
+  pushed_.clear();
   PickPlan plan;
   PickResult result = plan_pick(start_of(robot), request, plan);
 

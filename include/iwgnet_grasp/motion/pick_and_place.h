@@ -113,7 +113,9 @@ class PickAndPlace {
   PickResult run(Robot& robot, const PickRequest& request,
                  const std::function<bool(const std::string&)>& phase = {});
   // Pushes one of the objects (centroids of their visible surfaces, base_link, m) with the fingers,
-  // as grasping::find_pushes() proposes, and brings the arm to the observing pose.
+  // as grasping::find_pushes() proposes, and brings the arm to the observing pose. Not in the
+  // direction of a push since the last pick if another is possible: what clings together moves on
+  // together.
   PickResult push(Robot& robot, const std::vector<Eigen::Vector3d>& objects);
   // Brings the arm to the observing pose.
   PickResult observe(Robot& robot);
@@ -148,6 +150,7 @@ class PickAndPlace {
   CollisionWorld world_;
   grasping::HeightMap heights_;
   std::optional<JointVector> commanded_;  // where the last trajectory ended
+  std::vector<Eigen::Vector2d> pushed_;   // directions of the pushes since the last pick, unit
 };
 
 }  // namespace iwgnet_grasp::motion
