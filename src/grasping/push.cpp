@@ -12,6 +12,7 @@ constexpr double kStep = 0.002;  // m
 // undersides (grasping.yaml: finger_outline, finger_bodies, palm).
 const Eigen::Vector2d kTips(0.013, 0.013), kFingers(0.040, 0.024), kBody(0.048, 0.042);
 constexpr double kFingersAbove = 0.035, kBodyAbove = 0.060;
+constexpr double kHigher[] = {0.0, 0.02, 0.04};  // m over the usual height of the tips
 constexpr double kAhead = 0.08;      // m beyond the push's end that count as in its way
 constexpr double kHalfWidth = 0.03;  // m of what counts
 
@@ -26,39 +27,46 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
   std::vector<Candidate> candidates;
   const Eigen::Vector2d low = cell.workspace_min.array() + config.margin,
                         high = cell.workspace_max.array() - config.margin;
+  // Against one object in one direction, the tips `tip` over the table.
+  const auto try_push = [&](const Eigen::Vector2d& center, const Eigen::Vector2d& along, double tip) {
+    const double closing = std::atan2(along.y(), along.x()) + M_PI / 2;
+    const auto free = [&](const Eigen::Vector2d& p, const Eigen::Vector2d& half, double above_tips) {
+      return heights.max_in(p, closing, half) + config.clearance <= tip + above_tips;
+    };
+    const auto has_room = [&](const Eigen::Vector2d& p) {
+      return free(p, kTips, 0.0) && free(p, kFingers, kFingersAbove) && free(p, kBody, kBodyAbove);
+    };
+    double back = kTips.y();
+    while (back <= config.run_up && !has_room(center - back * along)) back += kStep;
+    if (back > config.run_up) return false;
+    const Eigen::Vector2d from = center - back * along;
+    double met = 0.0;  // m, at the centroid at the latest
+    while (met < back && free(from + met * along, kTips, 0.0)) met += kStep;
+    double way = met;
+    const auto goes_on = [&] {
+      const Eigen::Vector2d end = center + (way - met + kStep) * along;
+      return (end.array() >= low.array()).all() && (end.array() <= high.array()).all() &&
+             free(from + (way + kStep) * along, kBody, kBodyAbove);
+    };
+    while (way - met < config.distance && goes_on()) way += kStep;
+    if (way - met < config.min_distance) return false;
+    double sum = 0.0;
+    int cells = 0;
+    for (double s = 0.0; s <= way + kAhead; s += 2 * kStep)
+      for (double t = -kHalfWidth; t <= kHalfWidth; t += 2 * kStep, ++cells) {
+        const Eigen::Vector2d p = from + s * along + t * Eigen::Vector2d(-along.y(), along.x());
+        sum += heights.at(p.x(), p.y());
+      }
+    candidates.push_back({{from, from + way * along, tip}, sum / cells});
+    return true;
+  };
   for (const Eigen::Vector3d& object : objects)
     for (int i = 0; i < kDirections; ++i) {
-      const double angle = 2 * M_PI * i / kDirections, closing = angle + M_PI / 2;
-      const Eigen::Vector2d along(std::cos(angle), std::sin(angle)), center = object.head<2>();
-      const auto free = [&](const Eigen::Vector2d& p, const Eigen::Vector2d& half, double underside) {
-        return heights.max_in(p, closing, half) + config.clearance <= config.tip_height + underside;
-      };
-      double back = kTips.y();
-      while (back <= config.run_up &&
-             !(free(center - back * along, kTips, 0.0) &&
-               free(center - back * along, kFingers, kFingersAbove)))
-        back += kStep;
-      if (back > config.run_up) continue;
-      const Eigen::Vector2d from = center - back * along;
-      double met = 0.0;  // m, at the centroid at the latest
-      while (met < back && free(from + met * along, kTips, 0.0)) met += kStep;
-      double way = met;
-      const auto goes_on = [&] {
-        const Eigen::Vector2d end = center + (way - met + kStep) * along;
-        return (end.array() >= low.array()).all() && (end.array() <= high.array()).all() &&
-               free(from + (way + kStep) * along, kBody, kBodyAbove);
-      };
-      while (way - met < config.distance && goes_on()) way += kStep;
-      if (way - met < config.min_distance || !free(from, kBody, kBodyAbove)) continue;
-      const Push push{from, from + way * along};
-      double sum = 0.0;
-      int cells = 0;
-      for (double s = 0.0; s <= way + kAhead; s += 2 * kStep)
-        for (double t = -kHalfWidth; t <= kHalfWidth; t += 2 * kStep, ++cells) {
-          const Eigen::Vector2d p = push.from + s * along + t * Eigen::Vector2d(-along.y(), along.x());
-          sum += heights.at(p.x(), p.y());
-        }
-      candidates.push_back({push, sum / cells});
+      const double angle = 2 * M_PI * i / kDirections;
+      for (const double higher : kHigher)  // the lowest at which the gripper's body passes
+        if (object.z() > config.tip_height + higher &&
+            try_push(object.head<2>(), {std::cos(angle), std::sin(angle)}, config.tip_height + higher))
+          break;
     }
   std::stable_sort(candidates.begin(), candidates.end(), [](const auto& a, const auto& b) {
     return a.in_the_way < b.in_the_way;

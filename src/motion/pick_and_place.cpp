@@ -451,7 +451,7 @@ bool PickAndPlace::plan_push(const JointVector& start, const grasping::Push& pus
   T.linear().col(2) = -Eigen::Vector3d::UnitZ();
   T.linear().col(1) << way.normalized(), 0.0;
   T.linear().col(0) = T.linear().col(1).cross(T.linear().col(2));
-  T.translation() << push.from, config_.push.tip_height + kinematics::kPadHeight / 2;
+  T.translation() << push.from, push.tip_height + kinematics::kPadHeight / 2;
   world_.set_attached(std::nullopt);
   world_.set_gripper_gap(config_.push.gap);
   world_.set_columns({Column(T)});

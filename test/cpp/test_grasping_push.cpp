@@ -60,9 +60,14 @@ TEST(Push, KeepsTheObjectInTheWorkspaceAndTheGripperOffWhatIsHigh) {
   ASSERT_FALSE(pushes.empty());
   for (const Push& push : pushes) EXPECT_LT((push.to - push.from).normalized().x(), 0.2);
 
-  Table high;
+  Table high;  // 90 mm: the tips go higher, so that the body passes
   high.add(kMiddle.x(), kMiddle.y(), {0.02, 0.02, 0.09});
-  EXPECT_TRUE(high.pushes({kMiddle}).empty());
+  const auto above = high.pushes({{0.5, 0.0, 0.09}});
+  ASSERT_FALSE(above.empty());
+  for (const Push& push : above) EXPECT_NEAR(push.tip_height, table.config.tip_height + 0.04, 1e-9);
+  Table tower;
+  tower.add(kMiddle.x(), kMiddle.y(), {0.02, 0.02, 0.15});
+  EXPECT_TRUE(tower.pushes({{0.5, 0.0, 0.15}}).empty());
 }
 
 TEST(Push, NeedsRoomForTheFingers) {

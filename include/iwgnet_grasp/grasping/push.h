@@ -10,7 +10,7 @@ namespace iwgnet_grasp::grasping {
 
 struct PushConfig {       // config/motion.yaml, section "push"
   double gap;             // m between the pads while pushing
-  double tip_height;      // m, finger tips over the table
+  double tip_height;      // m, finger tips over the table; higher only against a high pile
   double clearance;       // m, tips over whatever lies where they go down
   double run_up;          // m from the object's centroid at most, to where they go down
   double distance, min_distance;  // m that the fingers go on once they meet something, as far as the
@@ -22,6 +22,7 @@ struct PushConfig {       // config/motion.yaml, section "push"
 // The tips go down at `from`, closing direction across the way, and move straight to `to`.
 struct Push {
   Eigen::Vector2d from, to;  // m, base_link
+  double tip_height;         // m over the table
 };
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
