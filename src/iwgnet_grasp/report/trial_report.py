@@ -102,7 +102,8 @@ def _trials_markdown(report: Report, others: Sequence[dict], pictures: Path) -> 
     text.append(
         "A trial succeeds when every object ends in the tray by its first grasp without slip "
         "(5 mm, 5 deg), drop or collision; the simulator's judge says so. GSR: grasps that "
-        "succeed of all that were tried. Slip and placement: median / largest. picks/h counts "
+        "succeed of all that were tried. Pushes: objects pushed aside, not gripped, where no grasp "
+        "was good (the paper has none). Slip and placement: median / largest. picks/h counts "
         "computation at its wall time."
     )
     figures.write_figure(figures.success_figure(report.runs), pictures / "trials.png")
@@ -232,7 +233,8 @@ def _run_html(title: str, summary: dict) -> str:
             f"<p><code>{html.escape(command_line(run))}</code><br>"
             f"{html.escape(conditions_line(run))}.{html.escape(_code(summary))}</p>",
             _table(*_without_empty(*success_rows(summary))),
-            "<p>GSR: grasps that succeed of all that were tried. Slip and placement: median / "
+            "<p>GSR: grasps that succeed of all that were tried. Pushes: objects pushed aside, not "
+            "gripped, where no grasp was good (the paper has none). Slip and placement: median / "
             "largest. picks/h counts computation at its wall time.</p>",
             "<h3>Failed trials by what failed first</h3>",
             f"<figure>{figures.as_svg(figures.cause_figure(summary))}</figure>",
