@@ -35,17 +35,6 @@ void bind_motion(py::module_& m) {
           "of the path planner")
       .def_readwrite("grip_force", &PickPlaceConfig::grip_force, "N");
   m.def("load_pick_place_config", &motion::load_pick_place_config, "config_dir"_a);
-  m.def(
-      "find_pushes",
-      [](const grasping::HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
-         const CellConfig& cell, const PickPlaceConfig& config) {
-        std::vector<std::pair<Eigen::Vector2d, Eigen::Vector2d>> ways;
-        for (const auto& push : grasping::find_pushes(heights, objects, cell, config.push))
-          ways.emplace_back(push.from, push.to);
-        return ways;
-      },
-      "heights"_a, "objects"_a, "cell"_a, "config"_a,
-      "Pushes against objects (3,) m in base_link as [(from, to)] (2,) m, the best first.");
   py::class_<PickAndPlace>(m, "PickAndPlace",
                            "Approach, grasp, lift, transfer, release, back to observing.")
       .def(py::init<const CellConfig&, const PickPlaceConfig&>(), "cell"_a, "config"_a)

@@ -61,7 +61,7 @@ class Cell(Protocol):
         """Picks the object and puts it into the tray; the arm ends out of the camera's view."""
 
     def push(self, scene_id: int) -> Outcome:
-        """Pushes some object of the newest plan aside, so that the pile lies otherwise; the arm
+        """Pushes some object of the newest look aside, so that the pile lies otherwise; the arm
         ends out of the camera's view. Nothing is gripped."""
 
     def time(self) -> float:

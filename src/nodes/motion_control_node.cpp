@@ -1,5 +1,5 @@
-// Node 4: plans and executes one pick and place, or one push, at a time through the arm's trajectory controller
-// and gripper_control.
+// Node 4: plans and executes one pick and place, or one push, at a time through the arm's trajectory
+// controller and gripper_control.
 #include <actionlib/server/simple_action_server.h>
 #include <control_msgs/FollowJointTrajectoryAction.h>
 #include <iwgnet_grasp/GraspPoses.h>
@@ -255,6 +255,16 @@ class MotionControl {
     throw Error(Topics::GRASP_POSE + " holds nothing for " + which);
   }
 
+  template <typename Server, typename Result>
+  static void finish(Server& server, const Result& result) {
+    if (server.isPreemptRequested())
+      server.setPreempted(result, result.message);
+    else if (result.success)
+      server.setSucceeded(result, result.message);
+    else
+      server.setAborted(result, result.message);
+  }
+
   void pick(const PickPlaceGoal& goal) {
     const std::lock_guard motion_lock(motion_mutex_);
     PickPlaceResult result;
@@ -281,12 +291,7 @@ class MotionControl {
       result.message = error.what();
     }
     if (!result.success) ROS_WARN("motion_control: pick refused or failed: %s", result.message.c_str());
-    if (server_.isPreemptRequested())
-      server_.setPreempted(result, result.message);
-    else if (result.success)
-      server_.setSucceeded(result, result.message);
-    else
-      server_.setAborted(result, result.message);
+    finish(server_, result);
   }
 
   void push(const PushGoal& goal) {
@@ -307,12 +312,7 @@ class MotionControl {
     }
     ROS_INFO("motion_control: push in scene %u: %s", goal.scene_id,
              result.success ? "done" : result.message.c_str());
-    if (push_server_.isPreemptRequested())
-      push_server_.setPreempted(result, result.message);
-    else if (result.success)
-      push_server_.setSucceeded(result, result.message);
-    else
-      push_server_.setAborted(result, result.message);
+    finish(push_server_, result);
   }
 
   bool observe(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {

@@ -27,8 +27,8 @@ struct Push {
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
 // room, nearest to the object in each of 16 directions, as far as what is there is not so high that
-// the gripper's body would touch it and the object stays in the workspace. Those with the least in their way first:
-// an object moves away from its neighbours rather than into them.
+// the gripper's body would touch it and the object stays in the workspace. Those with the least in
+// their way first: an object moves away from its neighbours rather than into them.
 std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
                               const CellConfig& cell, const PushConfig& config);
 

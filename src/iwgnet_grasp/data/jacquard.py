@@ -60,8 +60,13 @@ class JacquardSample:
 
 def find_jacquard(root: Path, depth_kind: str = "stereo") -> list[JacquardSample]:
     """All samples below a folder that have a grasps.txt, in the order of their names."""
-    files = sorted(root.rglob(f"*{_GRASPS}"))
-    return [JacquardSample(f.with_name(f.name.removesuffix(_GRASPS)), depth_kind) for f in files]
+    return [JacquardSample(stem, depth_kind) for stem in find_stems(root, _GRASPS)]
+
+
+def find_stems(root: Path, ending: str) -> list[Path]:
+    """What the names of an object's files begin with, of all below a folder that have one with
+    this ending, in the order of their names."""
+    return [f.with_name(f.name.removesuffix(ending)) for f in sorted(root.rglob(f"*{ending}"))]
 
 
 def read_grasps(path: Path) -> np.ndarray:

@@ -16,6 +16,7 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.images import read_depth
+from iwgnet_grasp.data.jacquard import find_stems
 from iwgnet_grasp.networks.object_mask import normalise_grey
 
 log = logging.getLogger(__name__)
@@ -34,10 +35,8 @@ class MaskViews:
 
 
 def find_masks(folder: Path) -> list[Path]:
-    """What the names of the files of each object of a set begin with, also of those that nothing
-    can grasp."""
-    ending = "_mask.png"
-    return [f.with_name(f.name.removesuffix(ending)) for f in sorted(folder.rglob(f"*{ending}"))]
+    """jacquard.find_stems() of all objects of a set, also of those that nothing can grasp."""
+    return find_stems(folder, "_mask.png")
 
 
 def load_mask_views(

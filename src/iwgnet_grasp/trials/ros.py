@@ -268,9 +268,7 @@ class RosCell:
         return Outcome(result.success, reason, result.message)
 
     def push(self, scene_id: int) -> Outcome:
-        seen, planned = self._planned
-        goal = PushGoal(scene_id=planned if scene_id == seen else scene_id)
-        result = self._move(self._push, Topics.PUSH, goal)
+        result = self._move(self._push, Topics.PUSH, PushGoal(scene_id=scene_id))
         return Outcome(result.success, "" if result.success else "not_pushed", result.message)
 
     def _move(self, client: Any, name: str, goal: Any) -> Any:

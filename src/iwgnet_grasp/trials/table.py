@@ -13,16 +13,8 @@ Rows = list[list[str]]
 def success_rows(summary: dict) -> tuple[list[str], Rows]:
     """Head and rows: a scene a row, the paper's figure beside ours."""
     head = ["scene", "success", "rate", "95 % interval", "paper", "attempts", "GSR", "pushes"]
-    head += [
-        "cleared",
-        "picks/h",
-        "slip mm",
-        "slip deg",
-        "placement mm",
-        "simulated s",
-        "wall s",
-        "x real",
-    ]
+    head += ["cleared", "picks/h", "slip mm", "slip deg", "placement mm"]
+    head += ["simulated s", "wall s", "x real"]
     rows = []
     for scene, s in summary["scenes"].items():
         paper = PAPER_SUCCESSES.get(scene)
