@@ -28,6 +28,7 @@ constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surfa
 constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
 constexpr int kPlaneTrials = 200;
 constexpr double kGoesOn = 0.004;         // m from where a straight upper side would be
+constexpr double kBetween = 0.010;        // m beside the middle between the pads: an object between them lies nearer
 constexpr double kShank = 0.03;           // m, up to this width nothing slides out of the fingers
 constexpr double kSnug = 0.006;           // m, cells of the height map, noise of the network's width
 constexpr double kSideShare = 0.4;        // of the overlap of finger and object, up from the tips: where the
@@ -400,6 +401,7 @@ GraspPoseConfig load_grasp_pose_config(const std::string& config_dir) {
   config.shift_scale = positive("shift_scale");
   config.lever_scale = positive("lever_scale");
   config.hang_scale = positive("hang_scale");
+  config.overhang_scale = positive("overhang_scale");
   config.width_scale = positive("width_scale");
   config.finger_thickness = positive("finger_thickness");
   if (config.min_engagement > config.insertion_depth)
@@ -576,12 +578,17 @@ GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsic
     const Eigen::Vector3d away =
         pose.T_base_tcp.linear().transpose() * (*centroid - pose.T_base_tcp.translation());
     const double lever = away.y() / config.lever_scale, hang = std::max(0.0, away.z()) / config.hang_scale;
-    pose.quality *= std::exp(-lever * lever - hang * hang);
+    const double overhang = std::max(0.0, std::abs(away.x()) - kBetween) / (config.overhang_scale * pose.engagement);
+    pose.quality *= std::exp(-lever * lever - hang * hang - overhang * overhang);
     return pose;
   };
   const double width = std::min(located.pose.width, config.max_opening);
   const Slope slope = slope_of(located, heights, config);
   GraspPose best = with_lever(leaning(located, slope, heights, config));
+  // A rim goes on round the hole, not straight along the pads.
+  const bool rim = centroid && std::abs(located.axes.along.dot(centroid->head<2>() - located.axes.center)) >
+                                   std::max(kBetween, located.pose.width);
+  if (rim) return best;
   for (const double shift : config.shifts) {
     Located beside = located;
     beside.axes.center += shift * located.axes.across;

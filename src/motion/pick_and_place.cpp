@@ -20,7 +20,11 @@ using Clock = std::chrono::steady_clock;
 constexpr double kSamePlace = 0.03;      // rad: a measured arm this near is where it was sent
 constexpr double kAtRest = 0.005;        // rad: near enough to the observing pose to stay
 constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wall
+constexpr double kPileClearance = 0.015; // m, the lowest point of a carried part over the pile
+constexpr double kHigherLift = 0.05;     // m over approach_height, at most
 constexpr double kFarthestCentroid = 0.04;  // m from the grasp point: farther out nothing is gripped
+constexpr double kBeside = 0.012;        // m beside the closing line's middle: what is gripped across lies nearer
+constexpr double kFarthestFromRim = 0.070;  // m, likewise where a rim is gripped
 constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
 constexpr int kReached = 4;              // configurations kept for a pose, nearest first
@@ -225,13 +229,20 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
     ends[side] = y;
   }
   const double length = ends[0] + ends[1];
-  held.lengthwise = width > kLengthwise && length < width;
-  const double center_y = (T_base_view.inverse() * centroid).y();
-  held.offset = held.lengthwise ? 0.0 : std::clamp(center_y, -kFarthestCentroid, kFarthestCentroid);
+  const Eigen::Vector2d center = (T_base_view.inverse() * centroid).head<2>();
+  if (width > kLengthwise && length < width) {
+    held.axis = Eigen::Vector2d::UnitX();
+  } else if (width <= kLengthwise && std::abs(center.x()) > kBeside) {
+    // A rim between the pads: the rest of the part lies beside them, not between.
+    held.offset = center.normalized() * std::min(center.norm(), kFarthestFromRim);
+    if (std::abs(center.x()) > std::abs(center.y())) held.axis = center.normalized();
+  } else {
+    held.offset.y() = std::clamp(center.y(), -kFarthestCentroid, kFarthestCentroid);
+  }
   // How far it reaches down cannot be seen from above, only that it ends at the table. Turned upright
   // over the tray it hangs lower by what the gripper leans now.
   const Eigen::Vector3d tips = T_base_view * Eigen::Vector3d(0, 0, tip);
-  const double tilt = std::abs(T_base_view.linear()(2, held.lengthwise ? 0 : 1));
+  const double tilt = std::abs(T_base_view.linear().row(2).head<2>().dot(held.axis));
   const double table = (tips.z() + config_.held_reach * tilt) / T_base_view.linear()(2, 2);
   held.hang = std::clamp(table, 0.0, config_.max_hang);
   return held;
@@ -275,17 +286,22 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   world_.set_attached(std::nullopt);
   world_.set_gripper_gap(grasp.opening);
   world_.set_columns({grasp_column});
+  // What a part hides below it may reach down to the table: all of it goes over all others.
+  const double lift = std::clamp(heights_.highest() + kPileClearance, config_.approach_height,
+                                 config_.approach_height + kHigherLift);
   const auto grasps = reach(world_, {grasp.T_base_tcp, half_turn(grasp.T_base_tcp)}, grasp.width,
-                            config_.approach_height, start, config_.limits, why);
+                            lift, start, config_.limits, why);
   if (grasps.empty())
     return finish(PickReason::kUnreachable, "grasp at " + millimetres(at) + ": " + why);
 
   // Slot: the part's long axis along y, its centroid over the slot's centre. The fingers close across
-  // the long axis, unless they hold the part by its end from both sides along it.
+  // the long axis, unless they hold the part by its end along it or by the rim of a hole.
   const HeldPart seen = held_part(grasp.T_base_tcp, grasp.width, request.centroid);
-  const bool lengthwise = seen.lengthwise;
   // In the TCP frame, whose y axis is the view's turned round.
-  const Eigen::Vector3d offset(0.0, -seen.offset, 0.0);
+  const Eigen::Vector3d offset(seen.offset.x(), -seen.offset.y(), 0.0);
+  const Eigen::Vector3d axis(seen.axis.x(), -seen.axis.y(), 0.0);
+  // By how much the closing direction is turned from the slot's x for the axis to lie along its y.
+  const double turn = std::remainder(M_PI / 2 - std::atan2(axis.y(), axis.x()), M_PI);
   // A part that reaches less far below the tips falls the rest; on the way down from where it may
   // touch, the tool is slow.
   const double last = std::min(seen.hang, config_.max_fall);
@@ -296,7 +312,7 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
   const auto slot_poses = [&](int grasp_turn, double shift) {
     Pose T = Pose::Identity();
     T.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
-    if (lengthwise) T.rotate(Eigen::AngleAxisd(M_PI / 2, Eigen::Vector3d::UnitZ()));
+    T.rotate(Eigen::AngleAxisd(turn, Eigen::Vector3d::UnitZ()));
     std::array<Pose, 2> poses{T, half_turn(T)};
     for (Pose& pose : poses) {
       const Eigen::Vector3d centroid = grasp_turn == 0 ? offset : Eigen::Vector3d(-offset);
@@ -338,9 +354,8 @@ PickResult PickAndPlace::plan_pick(const JointVector& start, const PickRequest& 
 
   AttachedPart part;
   const double half_length = std::max(0.0, config_.held_length / 2 - config_.held_radius);
-  const Eigen::Vector3d half = half_length * (lengthwise ? Eigen::Vector3d::UnitX() : Eigen::Vector3d::UnitY());
-  part.a = offset - half;
-  part.b = offset + half;
+  part.a = offset - half_length * axis;
+  part.b = offset + half_length * axis;
   part.radius = config_.held_radius;
 
   const int tries = std::min<int>(kCombinations, static_cast<int>(combinations.size()));

@@ -64,6 +64,8 @@ struct GraspPoseConfig {  // config/grasping.yaml, section "pose"
   double shift_scale;        // m of such a shift, likewise
   double lever_scale;        // m from the centroid along the pads, likewise
   double hang_scale;         // m of the centroid beyond the pads along the approach, likewise
+  double overhang_scale;     // times the engagement that the centroid lies beside the pads along the
+                             // closing direction, likewise
   double width_scale;        // m of the width beyond a shank's, likewise
   double finger_thickness;   // m, of a finger along the closing direction, outside the pad face
   // Outer side of a finger above its tip: (m outwards from the pad face, m above the tip).
@@ -109,7 +111,8 @@ double alone_share(const GraspPose& pose, double width, const GraspPoseConfig& c
 
 // grasp_pose() at the grasp's place and beside it along the pads, whichever is best: quality also
 // falls with the distance from the network's place and from the object's centroid (base_link) where
-// that is known, along the pads and along the approach, each as exp(-(amount / scale)^2).
+// that is known, along the pads, along the approach and beside the pads, each as
+// exp(-(amount / scale)^2). A rim, which has its object beside it, is gripped nowhere else.
 GraspPose aligned_grasp_pose(const GraspRectangle& grasp, const PinholeIntrinsics& camera,
                              const Pose& T_base_camera, const HeightMap& heights,
                              const CellConfig& cell, const GraspPoseConfig& config,

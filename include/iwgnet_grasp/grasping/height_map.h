@@ -34,6 +34,7 @@ class HeightMap {
   // Highest value within an oriented rectangle: centre, yaw, half extents (m).
   double max_in(const Eigen::Vector2d& center, double yaw, const Eigen::Vector2d& half) const;
 
+  double highest() const { return highest_; }  // m, of all cells
   const cv::Mat& grid() const { return grid_; }  // CV_32FC1, row = y, column = x
   Eigen::Vector2d origin() const { return origin_; }  // of cell (0, 0), m
   double resolution() const { return resolution_; }
@@ -42,7 +43,7 @@ class HeightMap {
   cv::Mat grid_;
   Eigen::Vector2d origin_{0, 0};
   double resolution_ = 0.002, outside_ = 0.0;
-  double highest_ = 0.0;  // m, of all cells
+  double highest_ = 0.0;
 };
 
 }  // namespace iwgnet_grasp::grasping

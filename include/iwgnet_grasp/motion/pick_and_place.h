@@ -124,11 +124,11 @@ class PickAndPlace {
   PickResult plan_pick(const JointVector& start, const PickRequest& request, PickPlan& plan);
 
  private:
-  // What the heights tell of the part that is grasped at the pose. It is laid into the tray by it.
+  // What the heights tell of the part that is grasped at the pose, as the gripper sees it from above: x
+  // closes. It is laid into the tray by it.
   struct HeldPart {
-    bool lengthwise = false;  // its long axis lies along the closing direction
-    double offset = 0.0;      // m from the grasp to its centroid, across the closing direction, in
-                              // the direction of closing x approach
+    Eigen::Vector2d axis = Eigen::Vector2d::UnitY();   // the long one, unit
+    Eigen::Vector2d offset = Eigen::Vector2d::Zero();  // m from the grasp to the part's centroid
     double hang = 0.0;        // m below the finger tips, at most: it lies on the table or higher
   };
   HeldPart held_part(const Pose& T_base_tcp, double width, const Eigen::Vector3d& centroid) const;

@@ -30,6 +30,7 @@ from iwgnet_grasp.perception.merged_depth import (
     taken_away,
     unexplained_surfaces,
 )
+from iwgnet_grasp.perception.rims import rim_grasps
 from iwgnet_grasp.perception.types import (
     NOBODY,
     Detection,
@@ -106,6 +107,7 @@ class PerceptionConfig:
     min_distance_px: float
     min_angle_rad: float
     min_own_share: float
+    rim_quality: float
     min_pixels: int
     min_height: float
     max_step: float
@@ -143,6 +145,7 @@ class PerceptionConfig:
             min_distance_px=float(grasps["min_distance_px"]),
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
             min_own_share=float(grasps["min_own_share"]),
+            rim_quality=float(grasps["rim_quality"]),
             min_pixels=int(pixels["min_pixels"]),
             min_height=float(pixels["min_height"]),
             max_step=float(pixels["max_step"]),
@@ -369,6 +372,9 @@ class Perception:
             config.min_distance_px,
             config.min_angle_rad,
         )
+        if config.rim_quality > 0:
+            heights = empty_depth[box.slices] - depth[box.slices]
+            kept += rim_grasps(mask, heights, box, config.rim_quality)
         covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
         free = math.exp(-covered * covered)
         radius = config.grasp_depth_radius_px
