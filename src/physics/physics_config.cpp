@@ -22,6 +22,9 @@ PhysicsConfig load_physics_config(const std::string& config_dir) {
   c.gravity = positive("gravity");
   c.iterations = file.get<int>("solver.iterations");
   if (c.iterations < 1) file.fail("solver.iterations", "must be at least 1");
+  c.grip_iterations = file.get<int>("solver.grip_iterations");
+  if (c.grip_iterations < c.iterations)
+    file.fail("solver.grip_iterations", "must not be fewer than solver.iterations");
   c.contact_erp = positive("solver.contact_erp");
   c.linear_slop = file.get<double>("solver.linear_slop");
   c.coupling_erp = positive("solver.coupling_erp");

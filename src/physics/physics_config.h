@@ -9,7 +9,7 @@ namespace iwgnet_grasp::physics {
 
 struct PhysicsConfig {
   double timestep, gravity;
-  int iterations;
+  int iterations, grip_iterations;
   double contact_erp, linear_slop, coupling_erp;
   double margin, breaking_distance, restitution;
   double sleep_linear, sleep_angular, sleep_time;

@@ -19,6 +19,8 @@ extern btScalar gContactBreakingThreshold;
 namespace iwgnet_grasp::physics {
 namespace {
 
+constexpr double kGrips = 0.5;  // of the gripper's least force
+
 // Groups as usual; of the robot's own links only those three arm joints apart may meet, the others
 // are neighbours that overlap at their joints.
 struct RobotFilter : btOverlapFilterCallback {
@@ -209,6 +211,9 @@ void World::simulate_robot(bool on) {
 
 void World::step() {
   if (impl_->simulated) impl_->robot->drive();
+  const auto& config = impl_->config;
+  const bool grips = impl_->simulated && impl_->robot->gripper().force > kGrips * config.min_force;
+  impl_->world->getSolverInfo().m_numIterations = grips ? config.grip_iterations : config.iterations;
   impl_->world->stepSimulation(impl_->config.timestep, 0);
   if (impl_->simulated) ++impl_->steps;
 }
