@@ -344,6 +344,26 @@ TEST(AlignedGraspPose, MovesAlongThePadsTowardsTheCentroid) {
   EXPECT_LT(drawn.quality, free.quality);
 }
 
+TEST(AlignedGraspPose, ARimThatHoldsAllOfItsPartBesideItMustBeHeldDeep) {
+  const auto at = [](double height, double beside) {  // a wall, 10 mm thick across y
+    Bench bench;
+    bench.bar(0.5, 0.0, 0.06, 0.01, height);
+    return aligned_grasp_pose(bench.rectangle(0.5, 0.0, height, M_PI / 2, 0.01), bench.camera, bench.T,
+                              bench.heights(), bench.cell, bench.config,
+                              Eigen::Vector3d(0.5, beside, height / 2));
+  };
+  double before = 1.0;
+  for (const double height : {0.030, 0.022, 0.014}) {
+    const GraspPose within = at(height, 0.0), rim = at(height, 0.05);
+    ASSERT_TRUE(within.feasible && rim.feasible);
+    const double overhang = (0.05 - 0.01) / (3.0 * rim.engagement);  // grasping.yaml, overhang_scale
+    EXPECT_NEAR(rim.quality / within.quality, std::exp(-overhang * overhang), 0.1);
+    EXPECT_LT(rim.quality, before);
+    before = rim.quality;
+    EXPECT_NEAR(rim.T_base_tcp.translation().x(), 0.5, 1e-3);  // a wall that goes on is no reason to shift
+  }
+}
+
 TEST(AlignedGraspPose, TakingANeighbourAlongCostsQuality) {
   Bench bench;
   bench.bar(0.5, 0.0, 0.12, 0.02, 0.03);
