@@ -22,7 +22,8 @@ OUTER, INNER = 26, 19  # px, radii
 FLAT = np.full((BOX.height, BOX.width), 0.022, np.float32)  # m
 
 
-def ring(inner: int = INNER, shank: bool = False) -> np.ndarray:
+def ring(inner: int = INNER, shank: bool = True) -> np.ndarray:
+    """A rod's end, its shank to the right."""
     image = np.zeros((BOX.height, BOX.width), np.uint8)
     cv2.circle(image, CENTRE, OUTER, 1, -1)
     if shank:
@@ -32,22 +33,22 @@ def ring(inner: int = INNER, shank: bool = False) -> np.ndarray:
     return image > 0
 
 
-def test_the_wall_of_a_ring_is_gripped_along_its_radius():
+def test_the_wall_of_a_hole_is_gripped_along_its_radius_away_from_the_rest():
+    """Not where the shank begins, nor beside it, where the rod would turn between the pads."""
     grasps = rim_grasps(ring(), FLAT, BOX, 0.4)
-    assert len(grasps) >= 12
+    assert len(grasps) >= 4
     centre = np.array([BOX.x + CENTRE[0], BOX.y + CENTRE[1]])
     for g in grasps:
         offset = np.array([g.x_px, g.y_px]) - centre
         along = np.array([math.cos(g.theta_rad), -math.sin(g.theta_rad)])
         assert abs(offset @ along) == pytest.approx(np.linalg.norm(offset), rel=0.01)
+        assert offset[0] < -0.8 * np.linalg.norm(offset)  # the shank is to the right
         outside = np.linalg.norm(offset) + g.width_px / 2
         inside = np.linalg.norm(offset) - g.width_px / 2
         assert outside == pytest.approx(OUTER, abs=1.5)
         # A 22 mm pad at 1 mm a pixel meets the hole by its edges.
         assert math.hypot(inside, 11) == pytest.approx(INNER, abs=1.5)
         assert -math.pi / 2 < g.theta_rad <= math.pi / 2 and g.quality == 0.4
-    angles = sorted(math.atan2(g.y_px - centre[1], g.x_px - centre[0]) for g in grasps)
-    assert np.diff(angles).max() < math.radians(50)  # all around
 
 
 def test_walls_that_the_camera_sees_from_the_side_shift_nothing():
@@ -56,19 +57,12 @@ def test_walls_that_the_camera_sees_from_the_side_shift_nothing():
     wall = np.zeros((BOX.height, BOX.width), np.uint8)
     cv2.circle(wall, CENTRE, INNER, 1, -1)
     cv2.circle(wall, (CENTRE[0] + 5, CENTRE[1]), INNER, 0, -1)
+    heights[(wall > 0) & ~mask] = 0.008
     mask |= wall > 0
-    heights[wall > 0] = 0.008
     heights[~mask] = np.nan
-    expected = {(round(g.x_px), round(g.y_px)) for g in rim_grasps(ring(), FLAT, BOX, 1.0)}
-    found = {(round(g.x_px), round(g.y_px)) for g in rim_grasps(mask, heights, BOX, 1.0)}
-    assert len(found & expected) >= 0.8 * len(expected)
-
-
-def test_a_rod_is_held_where_it_lies_ahead_of_the_fingers():
-    """Not where the shank begins, nor beside it, where the rod would turn between the pads."""
-    rod = rim_grasps(ring(shank=True), FLAT, BOX, 1.0)
-    assert len(rod) >= 4
-    assert all(g.x_px < BOX.x + CENTRE[0] - 5 for g in rod)
+    expected = [(g.x_px, g.y_px) for g in rim_grasps(ring(), FLAT, BOX, 1.0)]
+    found = [(g.x_px, g.y_px) for g in rim_grasps(mask, heights, BOX, 1.0)]
+    np.testing.assert_allclose(found, expected, atol=1.5)
 
 
 @pytest.mark.parametrize(
@@ -76,12 +70,13 @@ def test_a_rod_is_held_where_it_lies_ahead_of_the_fingers():
     [
         ring(inner=0),
         ring(inner=10),  # no finger fits in
+        ring(shank=False),  # nothing tells where the rest of the part is
         np.zeros((BOX.height, BOX.width), bool),
         np.ones((BOX.height, BOX.width), bool),
     ],
-    ids=["disc", "small hole", "nothing", "everything"],
+    ids=["disc", "small hole", "ring", "nothing", "everything"],
 )
-def test_what_has_no_hole_for_a_finger_has_no_rim(mask):
+def test_what_has_no_hole_that_a_finger_can_hold_it_by_has_no_rim(mask):
     assert rim_grasps(mask, FLAT, BOX, 1.0) == []
 
 

@@ -16,13 +16,16 @@ import numpy as np
 
 from iwgnet_grasp.perception.types import Box, GraspRectangle
 
-DIRECTIONS = 16  # around a hole
+DIRECTIONS = 24  # around a hole
 HALF_PAD_PX = 12.0  # half the width of a pad (22 mm), at 1 mm a pixel
 MIN_RADIUS_PX = 15.0  # of a hole that a finger fits into: half a pad and its thickness
 MAX_RADIUS_PX = 30.0
 MAX_WALL_PX = 16.0
 ROUNDNESS = 0.6  # least share of its enclosing circle that a hole fills; leaning ones are narrower
-MAX_ASIDE = 0.7  # tangent, 35 deg: the part's middle from a wall's radius
+MAX_ASIDE = 0.7  # tangent, 35 deg, between a wall's radius and where the rest of the part lies
+MIN_OFFSET_PX = (
+    8.0  # of that from the hole: a ring alone says nothing about what is hidden of its part
+)
 UPPER_PX = 15  # size of the neighbourhood whose highest place ...
 UPPER_STEP = 0.005  # m, ... the upper side is less than this below
 
@@ -41,20 +44,20 @@ def rim_grasps(
     rows, columns = np.nonzero(mask)
     grasps = []
     for x, y in _round_holes(upper):
+        # Where the rest of the part lies: beside a closing direction it would turn about that.
+        rest = np.array([columns.mean() - x, rows.mean() - y])
+        if np.hypot(*rest) < MIN_OFFSET_PX:
+            continue
         for k in range(DIRECTIONS):
             angle = 2 * math.pi * k / DIRECTIONS
             c, s = math.cos(angle), math.sin(angle)
             wall = _wall(upper, x, y, c, s)
-            if wall is None:
+            if wall is None or abs(rest @ (-s, c)) > -MAX_ASIDE * (rest @ (c, s)):
                 continue
             inner, outer = wall
             # The pad's edges meet the hole before its middle does.
             chord = math.sqrt(max(inner**2 - HALF_PAD_PX**2, 0.0))
             middle, width = (outer + chord) / 2, outer - chord
-            # The part would turn about the closing direction, were most of it beside that.
-            dx, dy = columns.mean() - x - middle * c, rows.mean() - y - middle * s
-            if abs(dy * c - dx * s) > MAX_ASIDE * abs(dx * c + dy * s):
-                continue
             theta = math.pi / 2 - (math.pi / 2 + angle) % math.pi
             grasps.append(
                 GraspRectangle(
