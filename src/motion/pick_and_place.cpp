@@ -23,7 +23,7 @@ constexpr double kWallClearance = 0.02;  // m, a carried part over the tray's wa
 constexpr double kPileClearance = 0.015; // m, the lowest point of a carried part over the pile
 constexpr double kHigherLift = 0.05;     // m over approach_height, at most
 constexpr double kFarthestCentroid = 0.04;  // m from the grasp point: farther out nothing is gripped
-constexpr double kBeside = 0.012;        // m beside the closing line's middle: what is gripped across lies nearer
+constexpr double kBeside = 0.020;        // m beside the closing line's middle: what is gripped across lies nearer
 constexpr double kFarthestFromRim = 0.070;  // m, likewise where a rim is gripped
 constexpr double kUpperSide = 0.012;     // m, a part's upper side is not more uneven
 constexpr double kSteepest = 0.7;        // slope, 35 deg: steeper parts cannot be held by a gripper pointing down
@@ -232,10 +232,10 @@ PickAndPlace::HeldPart PickAndPlace::held_part(const Pose& T_base_tcp, double wi
   const Eigen::Vector2d center = (T_base_view.inverse() * centroid).head<2>();
   if (width > kLengthwise && length < width) {
     held.axis = Eigen::Vector2d::UnitX();
-  } else if (width <= kLengthwise && std::abs(center.x()) > kBeside) {
+  } else if (width <= kLengthwise && std::abs(center.x()) > std::max(kBeside, std::abs(center.y()))) {
     // A rim between the pads: the rest of the part lies beside them, not between.
-    held.offset = center.normalized() * std::min(center.norm(), kFarthestFromRim);
-    if (std::abs(center.x()) > std::abs(center.y())) held.axis = center.normalized();
+    held.axis = center.normalized();
+    held.offset = held.axis * std::min(center.norm(), kFarthestFromRim);
   } else {
     held.offset.y() = std::clamp(center.y(), -kFarthestCentroid, kFarthestCentroid);
   }
