@@ -1,8 +1,8 @@
 """Grasps of a ring's wall: one finger stands in the hole, the other outside.
 
-They come from the object's outline alone. The wall is gripped along the radius: the outer finger
-lies on a line of the round outside, the inner one's two edges on the hole, so the part cannot turn
-about the closing direction however far its centre of mass is. The paper has none of these: its
+They come from the object's pixels alone. The wall is gripped along the radius, away from the rest of
+the part: the outer finger lies on a line of the round outside, the inner one's two edges on the
+hole, and the weight has no lever about the closing direction. The paper has none of these: its
 networks learn of grasps from outside, which a part between others often has no room for, while its
 holes are free.
 """
@@ -23,9 +23,7 @@ MAX_RADIUS_PX = 30.0
 MAX_WALL_PX = 16.0
 ROUNDNESS = 0.6  # least share of its enclosing circle that a hole fills; leaning ones are narrower
 MAX_ASIDE = 0.7  # tangent, 35 deg, between a wall's radius and where the rest of the part lies
-MIN_OFFSET_PX = (
-    8.0  # of that from the hole: a ring alone says nothing about what is hidden of its part
-)
+MIN_OFFSET_PX = 8.0  # of that from the hole: a ring alone does not tell what is hidden of its part
 UPPER_PX = 15  # size of the neighbourhood whose highest place ...
 UPPER_STEP = 0.005  # m, ... the upper side is less than this below
 
