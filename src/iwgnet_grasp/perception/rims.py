@@ -1,7 +1,7 @@
 """Grasps of a ring's wall: one finger stands in the hole, the other outside.
 
-They come from the object's pixels alone. The wall is gripped along the radius, away from the rest of
-the part: the outer finger lies on a line of the round outside, the inner one's two edges on the
+They come from the object's pixels alone. The wall is gripped along the radius, away from the rest
+of the part: the outer finger lies on a line of the round outside, the inner one's two edges on the
 hole, and the weight has no lever about the closing direction. The paper has none of these: its
 networks learn of grasps from outside, which a part between others often has no room for, while its
 holes are free.
