@@ -115,7 +115,6 @@ struct World::Impl {
     world->setForceUpdateAllAabbs(false);
     auto& info = world->getSolverInfo();
     info.m_timeStep = config.timestep;
-    info.m_numIterations = config.iterations;
     info.m_solverMode = SOLVER_USE_WARMSTARTING | SOLVER_SIMD | SOLVER_USE_2_FRICTION_DIRECTIONS;
     info.m_erp2 = config.contact_erp;
     info.m_erp = config.contact_erp;
@@ -214,7 +213,7 @@ void World::step() {
   const auto& config = impl_->config;
   const bool grips = impl_->simulated && impl_->robot->gripper().force > kGrips * config.min_force;
   impl_->world->getSolverInfo().m_numIterations = grips ? config.grip_iterations : config.iterations;
-  impl_->world->stepSimulation(impl_->config.timestep, 0);
+  impl_->world->stepSimulation(config.timestep, 0);
   if (impl_->simulated) ++impl_->steps;
 }
 

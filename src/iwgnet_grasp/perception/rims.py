@@ -14,6 +14,7 @@ import math
 import cv2
 import numpy as np
 
+from iwgnet_grasp.data.grasp_rectangle import wrap_theta
 from iwgnet_grasp.perception.types import Box, GraspRectangle
 
 DIRECTIONS = 24  # around a hole
@@ -56,7 +57,7 @@ def rim_grasps(
             # The pad's edges meet the hole before its middle does.
             chord = math.sqrt(max(inner**2 - HALF_PAD_PX**2, 0.0))
             middle, width = (outer + chord) / 2, outer - chord
-            theta = math.pi / 2 - (math.pi / 2 + angle) % math.pi
+            theta = float(wrap_theta(-angle))  # y points down
             grasps.append(
                 GraspRectangle(
                     box.x + x + middle * c, box.y + y + middle * s, theta, width, quality
