@@ -267,6 +267,9 @@ void bind_physics(py::module_& m) {
           "reset; camera, light and materials stay.")
       .def("show_parts", &SimulatedCell::show_parts, "shown"_a,
            "Whether the camera sees the parts; the physics keeps them.")
+      .def("view_around_parts", &SimulatedCell::view_around_parts, "margin"_a,
+           "From now on depth() and the ideal images hold only what lies this far (m) around the parts "
+           "that are not in the tray; None: all.")
       .def("set_light", &SimulatedCell::set_light, "light"_a)
       .def("set_part_material", &SimulatedCell::set_part_material, "part"_a, "material"_a)
       .def("set_table_material", &SimulatedCell::set_table_material, "material"_a)

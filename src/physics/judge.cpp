@@ -132,8 +132,7 @@ struct Judge::Impl {
 
   bool in_tray(const Pose& T) const {
     const Eigen::Vector3d p = T.translation();
-    const Eigen::Vector2d d = (p.head<2>() - cell.tray.center).cwiseAbs();
-    return (d.array() <= cell.tray.inner_size.array() / 2).all() && p.z() > cell.tray.floor_height &&
+    return cell.tray.covers(p.head<2>()) && p.z() > cell.tray.floor_height &&
            p.z() < cell.tray.wall_height + kTrayHeadroom;
   }
 };

@@ -302,6 +302,20 @@ struct SimulatedCell::Impl {
       renderer.set_pose(board->sheet, T_base_board);
       renderer.set_pose(board->plate, T_base_board * Eigen::Translation3d(board->plate_center));
     }
+    renderer.set_region(view_margin ? around_parts(*view_margin) : Eigen::AlignedBox3d());
+  }
+
+  Eigen::AlignedBox3d around_parts(double margin) const {
+    Eigen::AlignedBox3d box;
+    for (std::size_t i = 0; i < models.size(); ++i) {
+      const Pose T = world.part(static_cast<int>(i)).T_base_part;
+      if (config.tray.covers(T.translation().head<2>())) continue;
+      for (const Eigen::Vector3f& vertex : models[i].mesh.vertices) box.extend(T * vertex.cast<double>());
+    }
+    if (box.isEmpty()) return box;
+    box.min().array() -= margin;
+    box.max().head<2>().array() += margin;
+    return box;
   }
 
   struct LinkDrawing {
@@ -338,6 +352,7 @@ struct SimulatedCell::Impl {
   Judge judge;
   sensing::Renderer renderer;
   sensing::Light light;
+  std::optional<double> view_margin;  // m
 
   std::map<std::string, int> meshes, part_meshes;
   std::vector<LinkDrawing> drawings;
@@ -571,6 +586,10 @@ void SimulatedCell::lay_parts(const std::vector<Pose>& T_base_part) {
 
 void SimulatedCell::show_parts(bool shown) {
   for (const int instance : impl_->part_instances) impl_->renderer.set_visible(instance, shown);
+}
+
+void SimulatedCell::view_around_parts(std::optional<double> margin) {
+  impl_->view_margin = margin;
 }
 
 void SimulatedCell::set_light(const sensing::Light& light) { impl_->light = light; }

@@ -8,6 +8,7 @@
 #include <limits>
 #include <map>
 
+#include "iwgnet_grasp/sensing/pinhole.h"
 #include "parallel.h"
 #include "shading.h"
 
@@ -179,6 +180,7 @@ struct Renderer::Impl {
   std::vector<Mesh> meshes;
   std::vector<Instance> instances;
   bool dirty = true;
+  Eigen::AlignedBox3d region;  // empty: everywhere
   struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color(), reused
 
   Impl() : device(rtcNewDevice(nullptr)) {
@@ -226,17 +228,36 @@ struct Renderer::Impl {
     dirty = false;
   }
 
-  // Calls write(u, v, lane, packet) for every pixel after its packet was traced.
+  // The pixels that may see the region; it begins at a tile, so that rays are the same to the bit.
+  cv::Rect seen_region(const PinholeIntrinsics& camera, const Pose& T_base_camera) const {
+    const cv::Rect image(0, 0, camera.width, camera.height);
+    if (region.isEmpty()) return image;
+    const Pose T_camera_base = T_base_camera.inverse();
+    Eigen::AlignedBox2d seen;
+    for (int i = 0; i < 8; ++i) {
+      const Eigen::Vector3d p =
+          T_camera_base * region.corner(static_cast<Eigen::AlignedBox3d::CornerType>(i));
+      if (!(p.z() > 0)) return image;  // beside or behind the camera: no rectangle bounds it
+      seen.extend(project(camera, p));
+    }
+    const cv::Point first(cvFloor(seen.min().x()) / kTile * kTile, cvFloor(seen.min().y()) / kTile * kTile);
+    const cv::Point last(cvCeil(seen.max().x()) + 1, cvCeil(seen.max().y()) + 1);
+    return cv::Rect(first, last) & image;
+  }
+
+  // Calls write(u, v, lane, packet) for every pixel of the region after its packet was traced.
   template <typename Write>
   void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write) {
     commit();
     const RayFrame frame(camera, T_base_camera);
-    parallel_rows(camera.height, kTile, [&](int first, int) {
+    const cv::Rect region = seen_region(camera, T_base_camera);
+    parallel_rows(region.height, kTile, [&](int row, int) {
+      const int first = region.y + row;
       RTCIntersectContext context;
       rtcInitIntersectContext(&context);
       context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
       Packet packet(frame);
-      for (int u = 0; u < camera.width; u += kTile) {
+      for (int u = region.x; u < region.br().x; u += kTile) {
         packet.aim(frame, camera, u, first);
         rtcIntersect16(packet.valid, scene, &context, &packet.hit);
         for (int i = 0; i < kLanes; ++i)
@@ -374,11 +395,13 @@ void Renderer::clear_instances() {
   impl_->new_scene();
 }
 
+void Renderer::set_region(const Eigen::AlignedBox3d& box) { impl_->region = box; }
+
 cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                         cv::Mat* instances) {
   require_camera(camera);
-  cv::Mat depth(camera.height, camera.width, CV_32FC1);
-  if (instances) instances->create(camera.height, camera.width, CV_32SC1);
+  cv::Mat depth(camera.height, camera.width, CV_32FC1, kNaN);
+  if (instances) *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
   impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
     const float t = packet.hit.ray.tfar[lane];
     depth.ptr<float>(v)[u] = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID ? kNaN : t;
@@ -389,7 +412,7 @@ cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_came
 
 cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
   require_camera(camera);
-  cv::Mat ids(camera.height, camera.width, CV_32SC1);
+  cv::Mat ids(camera.height, camera.width, CV_32SC1, -1);
   impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
     ids.ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);  // invalid is -1
   });

@@ -97,6 +97,37 @@ TEST(Instances, NameWhatEachPixelShows) {
   EXPECT_EQ(renderer.instances(kCamera, Pose::Identity()).at<int>(120, 160), 0);
 }
 
+// What lies in the region looks the same to the bit, whatever tile it begins in; the rest is empty.
+TEST(Region, LimitsWhatIsTraced) {
+  Renderer renderer;
+  renderer.add_instance(renderer.add_mesh(sphere(0.3, 40)), {}, at(0.1, 0.05, 1.0));
+  renderer.add_instance(renderer.add_box({4, 4, 0.2}), {}, at(0, 0, 1.4));
+  cv::Mat whole_ids, ids;
+  const cv::Mat whole = renderer.depth(kCamera, Pose::Identity(), &whole_ids);
+  const Eigen::AlignedBox3d box(Eigen::Vector3d(-0.11, -0.07, 0.6), Eigen::Vector3d(0.23, 0.17, 1.2));
+  renderer.set_region(box);
+  const cv::Mat depth = renderer.depth(kCamera, Pose::Identity(), &ids);
+  int inside = 0, outside = 0;
+  for (int v = 0; v < depth.rows; ++v)
+    for (int u = 0; u < depth.cols; ++u) {
+      const float z = whole.at<float>(v, u);
+      if (box.contains(deproject(kCamera, u, v, z))) {
+        ++inside;
+        ASSERT_EQ(depth.at<float>(v, u), z) << u << ", " << v;
+        ASSERT_EQ(ids.at<int>(v, u), whole_ids.at<int>(v, u));
+      } else if (u < kCamera.cx - 0.11 / 0.6 * kCamera.fx - 4 ||  // a tile
+                 v > kCamera.cy + 0.17 / 0.6 * kCamera.fy + 4) {
+        ++outside;
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u))) << u << ", " << v;
+        ASSERT_EQ(ids.at<int>(v, u), -1);
+      }
+    }
+  EXPECT_GT(inside, 1000);
+  EXPECT_GT(outside, 1000);
+  renderer.set_region({});
+  EXPECT_EQ(cv::countNonZero(renderer.depth(kCamera, Pose::Identity()) != whole), 0);
+}
+
 // A matt grey floor seen from above, lit by a small lamp beside the camera.
 struct Scene {
   Renderer renderer;

@@ -17,12 +17,15 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from pycocotools import mask as coco_mask
 from typer.testing import CliRunner
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.generate import (
+    CONFIG,
     CROP_PX,
+    SceneMaker,
     as_detected,
     bounding_box,
     generate_dataset,
@@ -34,6 +37,7 @@ from iwgnet_grasp.data.jacquard import find_jacquard
 from iwgnet_grasp.data.lift_check import plan_check, require_stored, summary
 from iwgnet_grasp.data.mask_dataset import find_masks, load_mask_views
 from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
+from iwgnet_grasp.perception.merged_depth import crop_window
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES, SEED = 4, 8  # two piles of three looks, the second cut short
@@ -114,6 +118,21 @@ def test_the_object_rises_over_the_table_in_both_depths(dataset):
             depth = read_depth(Path(f"{sample.stem}_{kind}_depth.tiff"))
             table = np.median(depth[~mask & (depth > 0)])
             assert np.median(depth[mask & (depth > 0)]) < table - 0.005
+
+
+def test_crops_show_what_the_whole_image_shows():
+    """Images are rendered around the parts only."""
+    maker = SceneMaker(["connecting_rod"], yaml.safe_load(CONFIG.read_text()), detector=False)
+    crops = 0
+    for scene in maker.pile(SEED, 0):
+        whole = maker.cell.ideal_depth()
+        assert np.isnan(scene.ideal).sum() > np.isnan(whole).sum()
+        for o in scene.objects:
+            window = crop_window(scene.ideal, scene.empty_ideal, o.detected, CROP_PX)
+            rows, columns = (slice(first, first + CROP_PX) for first in (window.y, window.x))
+            assert np.array_equal(scene.ideal[rows, columns], whole[rows, columns], equal_nan=True)
+            crops += 1
+    assert crops > 0
 
 
 def test_boxes_are_those_of_their_masks(dataset):

@@ -22,6 +22,10 @@ struct TrayConfig {
   double wall_thickness;       // m
   int columns, rows;           // slots along x and y
 
+  // Whether a point (m, base_link, seen from above) lies within the walls.
+  bool covers(const Eigen::Vector2d& p) const {
+    return ((p - center).cwiseAbs().array() <= inner_size.array() / 2).all();
+  }
   // Slot centres on the floor in filling order, the far row first.
   std::vector<Eigen::Vector3d> slots() const;
   // Floor and four walls as collision boxes.

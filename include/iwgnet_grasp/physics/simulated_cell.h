@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <opencv2/core.hpp>
 #include <string>
 #include <utility>
@@ -89,6 +90,9 @@ class SimulatedCell {
   // are. Throws Error for another number of poses than of parts.
   void lay_parts(const std::vector<Pose>& T_base_part);
   void show_parts(bool shown);            // to the camera; the physics keeps them
+  // From now on depth() and the ideal images hold only what lies this far (m) around the parts that
+  // are not in the tray, NaN and -1 elsewhere: samples are cut out there. nullopt: all.
+  void view_around_parts(std::optional<double> margin);
   void set_light(const sensing::Light& light);
   void set_part_material(int part, const sensing::Material& material);
   void set_table_material(const sensing::Material& material);

@@ -42,6 +42,9 @@ class Renderer {
   void set_material(int instance, const Material& material);
   void set_visible(int instance, bool visible);
   void clear_instances();  // keeps the meshes
+  // From now on depth() and instances() trace only the pixels of the upright rectangle around the
+  // image of this box (m, base_link); elsewhere nothing is hit. An empty box: all pixels.
+  void set_region(const Eigen::AlignedBox3d& box);
 
   // CV_32FC1, m along the optical axis, NaN where no surface is hit. T_base_camera: optical -> base.
   // instances, where given, becomes what instances() returns for the same rays.

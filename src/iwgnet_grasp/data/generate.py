@@ -52,6 +52,7 @@ CONFIG = PACKAGE / "config" / "dataset.yaml"
 CROP_PX = 300  # side of a crop: the longest part is about 170 px at 0.6 m
 DEPTH_STEP = 2.0**-15  # m: 31 um, far below the noise; rounded floats compress well
 LOOKS = 3  # scenes of one pile
+_AROUND_PX = 190  # rendered beside the parts, at the table: half a crop and what its box is off by
 PILE_ATTEMPTS = 5  # with other draws, when a pile cannot be built
 
 
@@ -199,8 +200,10 @@ class SceneMaker:
 
     def observe(self, rng: np.random.Generator) -> Scene:
         """Images with and without parts, and the labels."""
-        cell = self.cell
+        cell, color_camera = self.cell, self.cell.camera.color
         color = cell.color() if self.detector else self.skip_frame()
+        distance = self.cell.camera.T_base_color[2, 3]
+        cell.view_around_parts(_AROUND_PX * distance / color_camera.fx)
         ideal, mask = cell.ideal_view()
         stereo = cell.aligned_depth(cell.depth())
         outline_areas = cell.unoccluded_areas()
@@ -209,6 +212,7 @@ class SceneMaker:
         empty_ideal = cell.ideal_depth()
         empty_stereo = cell.aligned_depth(cell.depth())
         cell.show_parts(True)
+        cell.view_around_parts(None)
         objects = []
         for part, family in enumerate(cell.part_families):
             seen = self.visible(mask == part, outline_areas[part])
