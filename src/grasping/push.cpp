@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 namespace iwgnet_grasp::grasping {
 namespace {
@@ -12,7 +13,6 @@ constexpr double kStep = 0.002;  // m
 // undersides (grasping.yaml: finger_outline, finger_bodies, palm).
 const Eigen::Vector2d kTips(0.013, 0.013), kFingers(0.040, 0.024), kBody(0.048, 0.042);
 constexpr double kFingersAbove = 0.035, kBodyAbove = 0.060;
-constexpr double kHigher[] = {0.0, 0.02, 0.04};  // m over the usual height of the tips
 constexpr double kAhead = 0.08;      // m beyond the push's end that count as in its way
 constexpr double kHalfWidth = 0.03;  // m of what counts
 
@@ -63,13 +63,13 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
   for (const Eigen::Vector3d& object : objects)
     for (int i = 0; i < kDirections; ++i) {
       const double angle = 2 * M_PI * i / kDirections;
-      for (const double higher : kHigher)  // the lowest at which the gripper's body passes
-        if (object.z() > config.tip_height + higher &&
-            try_push(object.head<2>(), {std::cos(angle), std::sin(angle)}, config.tip_height + higher))
+      for (const double tip : config.tip_heights)  // high: what lies below stays where it is
+        if (object.z() > tip + config.clearance &&
+            try_push(object.head<2>(), {std::cos(angle), std::sin(angle)}, tip))
           break;
     }
   std::stable_sort(candidates.begin(), candidates.end(), [](const auto& a, const auto& b) {
-    return a.in_the_way < b.in_the_way;
+    return std::make_pair(-a.push.tip_height, a.in_the_way) < std::make_pair(-b.push.tip_height, b.in_the_way);
   });
   std::vector<Push> pushes;
   for (const Candidate& candidate : candidates) pushes.push_back(candidate.push);

@@ -60,14 +60,28 @@ TEST(Push, KeepsTheObjectInTheWorkspaceAndTheGripperOffWhatIsHigh) {
   ASSERT_FALSE(pushes.empty());
   for (const Push& push : pushes) EXPECT_LT((push.to - push.from).normalized().x(), 0.2);
 
-  Table high;  // 90 mm: the tips go higher, so that the body passes
-  high.add(kMiddle.x(), kMiddle.y(), {0.02, 0.02, 0.09});
-  const auto above = high.pushes({{0.5, 0.0, 0.09}});
-  ASSERT_FALSE(above.empty());
-  for (const Push& push : above) EXPECT_NEAR(push.tip_height, table.config.tip_height + 0.04, 1e-9);
+  Table high;
+  high.add(kMiddle.x(), kMiddle.y(), {0.02, 0.02, 0.08});
+  high.config.tip_heights = {0.040, 0.007};  // at 7 mm the body would touch it
+  EXPECT_FALSE(high.pushes({{0.5, 0.0, 0.08}}).empty());
+  high.config.tip_heights = {0.007};
+  EXPECT_TRUE(high.pushes({{0.5, 0.0, 0.08}}).empty());
   Table tower;
   tower.add(kMiddle.x(), kMiddle.y(), {0.02, 0.02, 0.15});
   EXPECT_TRUE(tower.pushes({{0.5, 0.0, 0.15}}).empty());
+}
+
+TEST(Push, LeavesWhatLiesBelowTheObject) {
+  Table table;  // one bar across another
+  table.add(kMiddle.x(), kMiddle.y(), {0.02, 0.16, 0.02});
+  table.add(kMiddle.x(), kMiddle.y(), {0.16, 0.02, 0.04});
+  table.config.tip_heights = {0.040, 0.025, 0.007};
+  const auto upper = table.pushes({{kMiddle.x(), kMiddle.y(), 0.04}});
+  const auto lower = table.pushes({{kMiddle.x(), kMiddle.y() + 0.05, 0.02}});
+  ASSERT_FALSE(upper.empty());
+  ASSERT_FALSE(lower.empty());
+  for (const Push& push : upper) EXPECT_DOUBLE_EQ(push.tip_height, 0.025);
+  for (const Push& push : lower) EXPECT_DOUBLE_EQ(push.tip_height, 0.007);
 }
 
 TEST(Push, NeedsRoomForTheFingers) {

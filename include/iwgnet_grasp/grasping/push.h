@@ -10,7 +10,7 @@ namespace iwgnet_grasp::grasping {
 
 struct PushConfig {       // config/motion.yaml, section "push"
   double gap;             // m between the pads while pushing
-  double tip_height;      // m, finger tips over the table; higher only against a high pile
+  std::vector<double> tip_heights;  // m, finger tips over the table, the highest first
   double clearance;       // m, tips over whatever lies where they go down
   double run_up;          // m from the object's centroid at most, to where they go down
   double distance, min_distance;  // m that the fingers go on once they meet something, as far as the
@@ -26,9 +26,10 @@ struct Push {
 };
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
-// room, nearest to the object in each of 16 directions, as far as what is there is not so high that
-// the gripper's body would touch it and the object stays in the workspace. Those with the least in
-// their way first: an object moves away from its neighbours rather than into them.
+// room, nearest to the object in each of 16 directions, at the greatest height that still meets it, as
+// far as what is there is not so high that the gripper's body would touch it and the object stays in
+// the workspace. The highest first, then those with the least in their way: what lies on others slides
+// off them, and an object moves away from its neighbours rather than into them.
 std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
                               const CellConfig& cell, const PushConfig& config);
 
