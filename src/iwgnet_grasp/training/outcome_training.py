@@ -91,10 +91,11 @@ def train_outcome_network(
     KeyboardInterrupt when the user stops it.
     """
     prepare(settings.seed, threads)
-    described = [{"folder": f.name, **short_generator(describe_picks(f))} for f in data]
-    files, held_out = [], []
+    described, files, held_out = [], [], []
     for folder in data:
         piles = pile_files(folder)
+        made = {"piles": len(piles)}  # fewer than were asked for where the run was stopped
+        described.append({"folder": folder.name, **short_generator(describe_picks(folder)), **made})
         kept = len(piles) - max(round(settings.held_out * len(piles)), 1)
         files += piles[:kept]
         held_out += piles[kept:]
