@@ -35,7 +35,7 @@ from iwgnet_grasp.perception.merged_depth import (
     pixel_owners,
     taken_away,
 )
-from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, half_turn, select
+from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, select
 from iwgnet_grasp.perception.types import Window
 from iwgnet_grasp.training.detector import save_detector
 
@@ -237,12 +237,6 @@ def test_grasp_depth_is_the_surface_not_the_bore():
 
 
 # Candidates ---------------------------------------------------------------------------------------
-
-
-def test_half_turn_is_periodic():
-    assert half_turn(math.pi / 2) == pytest.approx(math.pi / 2)
-    assert half_turn(-math.pi / 2) == pytest.approx(math.pi / 2)
-    assert half_turn(0.3 + 5 * math.pi) == pytest.approx(0.3)
 
 
 def at(x: float, y: float, theta: float, quality: float) -> GraspRectangle:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from iwgnet_grasp.data.depth import normalise_depth
+from iwgnet_grasp.data.grasp_rectangle import angle_between, wrap_theta
 from iwgnet_grasp.data.letterbox import Region, checked_region
 from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.grasp_view import grasp_view, without_gaps
@@ -442,7 +443,7 @@ def in_image(estimate: Any, window: Window) -> GraspRectangle:
     return GraspRectangle(
         x_px=float(estimate.x_px) + window.x,
         y_px=float(estimate.y_px) + window.y,
-        theta_rad=half_turn(float(estimate.theta_rad)),
+        theta_rad=float(wrap_theta(estimate.theta_rad)),
         width_px=float(estimate.width_px),
         quality=float(estimate.quality),
     )
@@ -474,13 +475,8 @@ def select(
 def same_grasp(a: GraspRectangle, b: GraspRectangle, distance_px: float, angle_rad: float) -> bool:
     """True when centres are within distance_px and closing directions within angle_rad."""
     apart = math.hypot(a.x_px - b.x_px, a.y_px - b.y_px)
-    turned = abs(half_turn(a.theta_rad - b.theta_rad))
-    return apart <= distance_px and turned <= angle_rad
-
-
-def half_turn(angle: float) -> float:
-    """The same closing direction in (-pi/2, pi/2]; a gripper is the same turned by pi."""
-    return math.pi / 2 - (math.pi / 2 - angle) % math.pi
+    turned = angle_between(a.theta_rad, b.theta_rad)
+    return apart <= distance_px and bool(turned <= angle_rad)
 
 
 def _in_package(path: str) -> Path:

@@ -22,7 +22,7 @@ import numpy as np
 
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.generate import CROP_PX, LOOKS, PACKAGE
-from iwgnet_grasp.data.grasp_rectangle import Grasp
+from iwgnet_grasp.data.grasp_rectangle import Grasp, wrap_theta
 
 if TYPE_CHECKING:
     from iwgnet_grasp.data.generate import Scene, SceneMaker, SceneObject
@@ -174,7 +174,7 @@ def lift_pile(
 def _lift(lifter, scene: Scene, thing: SceneObject, grasp: Grasp) -> dict:
     """A grasp in px of the whole image, from the depth that the D455 measured."""
     from iwgnet_grasp.perception.merged_depth import grasp_depth, object_mask
-    from iwgnet_grasp.perception.pipeline import PerceptionConfig, half_turn
+    from iwgnet_grasp.perception.pipeline import PerceptionConfig
     from iwgnet_grasp.perception.types import GraspRectangle
 
     config = PerceptionConfig.load()
@@ -182,7 +182,7 @@ def _lift(lifter, scene: Scene, thing: SceneObject, grasp: Grasp) -> dict:
     lifter.cell.camera = scene.camera
     heights = lifter.heights(scene.stereo)
     rectangle = GraspRectangle(
-        grasp.x_px, grasp.y_px, half_turn(grasp.theta_rad), grasp.width_px, grasp.quality
+        grasp.x_px, grasp.y_px, float(wrap_theta(grasp.theta_rad)), grasp.width_px, grasp.quality
     )
     seen = object_mask(scene.stereo, scene.empty_stereo, thing.detected, config.min_height)
     radius = config.grasp_depth_radius_px
