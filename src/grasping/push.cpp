@@ -69,7 +69,10 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
           break;
     }
   std::stable_sort(candidates.begin(), candidates.end(), [](const auto& a, const auto& b) {
-    return std::make_pair(-a.push.tip_height, a.in_the_way) < std::make_pair(-b.push.tip_height, b.in_the_way);
+    const auto rank = [](const Candidate& c) {
+      return std::make_pair(-c.push.tip_height, c.in_the_way);
+    };
+    return rank(a) < rank(b);
   });
   std::vector<Push> pushes;
   for (const Candidate& candidate : candidates) pushes.push_back(candidate.push);

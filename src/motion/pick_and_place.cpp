@@ -181,9 +181,8 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   config.contact_tolerance = file.vector("contact_tolerance", kJoints);
   if (!(config.contact_tolerance.minCoeff() > 0)) file.fail("contact_tolerance", "must be positive");
   config.push.gap = positive("push.gap");
-  config.push.tip_heights = file.get<std::vector<double>>("push.tip_heights");
-  if (config.push.tip_heights.empty() || !std::is_sorted(config.push.tip_heights.rbegin(), config.push.tip_heights.rend()) ||
-      !(config.push.tip_heights.back() > 0))
+  const auto& heights = config.push.tip_heights = file.get<std::vector<double>>("push.tip_heights");
+  if (heights.empty() || !std::is_sorted(heights.rbegin(), heights.rend()) || !(heights.back() > 0))
     file.fail("push.tip_heights", "needs heights above 0, the highest first");
   config.push.clearance = positive("push.clearance");
   config.push.run_up = positive("push.run_up");

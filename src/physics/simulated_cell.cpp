@@ -310,7 +310,8 @@ struct SimulatedCell::Impl {
     for (std::size_t i = 0; i < models.size(); ++i) {
       const Pose T = world.part(static_cast<int>(i)).T_base_part;
       if (config.tray.covers(T.translation().head<2>())) continue;
-      for (const Eigen::Vector3f& vertex : models[i].mesh.vertices) box.extend(T * vertex.cast<double>());
+      for (const Eigen::Vector3f& vertex : models[i].mesh.vertices)
+        box.extend(T * vertex.cast<double>());
     }
     if (box.isEmpty()) return box;
     box.min().array() -= margin;

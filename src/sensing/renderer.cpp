@@ -240,7 +240,8 @@ struct Renderer::Impl {
       if (!(p.z() > 0)) return image;  // beside or behind the camera: no rectangle bounds it
       seen.extend(project(camera, p));
     }
-    const cv::Point first(cvFloor(seen.min().x()) / kTile * kTile, cvFloor(seen.min().y()) / kTile * kTile);
+    const cv::Point first(cvFloor(seen.min().x() / kTile) * kTile,
+                          cvFloor(seen.min().y() / kTile) * kTile);
     const cv::Point last(cvCeil(seen.max().x()) + 1, cvCeil(seen.max().y()) + 1);
     return cv::Rect(first, last) & image;
   }
