@@ -251,14 +251,14 @@ struct Renderer::Impl {
   void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write) {
     commit();
     const RayFrame frame(camera, T_base_camera);
-    const cv::Rect region = seen_region(camera, T_base_camera);
-    parallel_rows(region.height, kTile, [&](int row, int) {
-      const int first = region.y + row;
+    const cv::Rect seen = seen_region(camera, T_base_camera);
+    parallel_rows(seen.height, kTile, [&](int row, int) {
+      const int first = seen.y + row;
       RTCIntersectContext context;
       rtcInitIntersectContext(&context);
       context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
       Packet packet(frame);
-      for (int u = region.x; u < region.br().x; u += kTile) {
+      for (int u = seen.x; u < seen.br().x; u += kTile) {
         packet.aim(frame, camera, u, first);
         rtcIntersect16(packet.valid, scene, &context, &packet.hit);
         for (int i = 0; i < kLanes; ++i)

@@ -52,7 +52,7 @@ CONFIG = PACKAGE / "config" / "dataset.yaml"
 CROP_PX = 300  # side of a crop: the longest part is about 170 px at 0.6 m
 DEPTH_STEP = 2.0**-15  # m: 31 um, far below the noise; rounded floats compress well
 LOOKS = 3  # scenes of one pile
-_AROUND_PX = 190  # rendered beside the parts, at the table: half a crop and what its box is off by
+_AROUND_PX = CROP_PX // 2 + 40  # rendered beside the parts: half a crop, what its box is off by
 PILE_ATTEMPTS = 5  # with other draws, when a pile cannot be built
 
 
@@ -200,10 +200,10 @@ class SceneMaker:
 
     def observe(self, rng: np.random.Generator) -> Scene:
         """Images with and without parts, and the labels."""
-        cell, color_camera = self.cell, self.cell.camera.color
+        cell = self.cell
         color = cell.color() if self.detector else self.skip_frame()
-        distance = self.cell.camera.T_base_color[2, 3]
-        cell.view_around_parts(_AROUND_PX * distance / color_camera.fx)
+        camera = cell.camera
+        cell.view_around_parts(_AROUND_PX * camera.T_base_color[2, 3] / camera.color.fx)
         ideal, mask = cell.ideal_view()
         stereo = cell.aligned_depth(cell.depth())
         outline_areas = cell.unoccluded_areas()
