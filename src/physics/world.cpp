@@ -2,7 +2,6 @@
 
 #include <BulletCollision/CollisionShapes/btBoxShape.h>
 #include <BulletDynamics/Dynamics/btRigidBody.h>
-#include <BulletDynamics/Featherstone/btMultiBodyConstraintSolver.h>
 #include <btBulletCollisionCommon.h>
 
 #include <algorithm>
@@ -10,6 +9,7 @@
 #include <map>
 #include <utility>
 
+#include "contact_solver.h"
 #include "pieces.h"
 #include "robot_body.h"
 
@@ -108,7 +108,7 @@ struct World::Impl {
                                    ~btCollisionDispatcher::CD_USE_RELATIVE_CONTACT_BREAKING_THRESHOLD);
     broadphase = std::make_unique<btDbvtBroadphase>();
     broadphase->getOverlappingPairCache()->setOverlapFilterCallback(&filter);
-    solver = std::make_unique<btMultiBodyConstraintSolver>();
+    solver = std::make_unique<ContactSolver>();
     world = std::make_unique<ContactIslandWorld>(dispatcher.get(), broadphase.get(), solver.get(),
                                                  collision.get());
     world->setGravity(btVector3(0, 0, -config.gravity));
@@ -136,7 +136,7 @@ struct World::Impl {
   std::unique_ptr<PiecesConfiguration> collision;
   std::unique_ptr<btCollisionDispatcher> dispatcher;
   std::unique_ptr<btDbvtBroadphase> broadphase;
-  std::unique_ptr<btMultiBodyConstraintSolver> solver;
+  std::unique_ptr<ContactSolver> solver;
   std::unique_ptr<ContactIslandWorld> world;
   std::unique_ptr<RobotBody> robot;
   bool simulated = true;
