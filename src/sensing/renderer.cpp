@@ -2,12 +2,14 @@
 
 #include <embree3/rtcore.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstring>
 #include <limits>
 #include <map>
 
+#include "changed_tiles.h"
 #include "iwgnet_grasp/sensing/pinhole.h"
 #include "parallel.h"
 #include "shading.h"
@@ -23,11 +25,13 @@ constexpr float kOcclusionRange = 0.08f;  // m, of ambient occlusion: the size o
 constexpr float kSurfaceOffset = 2e-5f;   // m, keeps secondary rays off their own surface
 constexpr float kCrease = 0.77f;          // cos 40 deg: sharper edges are not shaded smooth
 constexpr int kPrintSamples = 6;          // a side of a pixel: the print's edges are smooth in the image
+constexpr double kStill = 1e-4;            // m, an object that moves less is drawn where it was
 constexpr float kFilterDepth = 0.004f;    // m, shadows are not smoothed across larger steps
 
 struct Mesh {
   RTCScene scene = nullptr;
   std::vector<std::array<Vec3, 3>> normals;  // of each triangle's corners, mesh frame
+  Eigen::AlignedBox3d box;                   // mesh frame
   cv::Mat print;                             // of a sheet, CV_8UC1; else empty
   float print_width = 0, print_height = 0;   // m
 };
@@ -38,6 +42,35 @@ struct Instance {
   Material material;
   Rotation R;  // instance -> base
   Vec3 t;
+  bool visible = true;
+};
+
+bool same(const Material& a, const Material& b) {
+  return a.albedo == b.albedo && a.metallic == b.metallic && a.roughness == b.roughness &&
+         a.texture == b.texture;
+}
+bool same(const Light& a, const Light& b) {
+  return a.position == b.position && a.intensity == b.intensity && a.ambient == b.ambient &&
+         a.radius == b.radius;
+}
+bool same(const PinholeIntrinsics& a, const PinholeIntrinsics& b) {
+  return a.width == b.width && a.height == b.height && a.fx == b.fx && a.fy == b.fy &&
+         a.cx == b.cx && a.cy == b.cy;
+}
+
+// What an image was made of, so that the next one is made anew only where it may differ.
+struct Drawn {
+  struct Object {
+    int mesh;
+    Material material;
+    bool visible;
+    Points corners;  // of its box
+  };
+  PinholeIntrinsics camera{};
+  Pose T_base_camera = Pose::Identity();
+  Light light;
+  std::vector<Object> objects;
+  bool whole = false;  // there is such an image
 };
 
 // Smooth shading: a corner's normal is the mean of the faces around it, weighted by their area,
@@ -181,7 +214,10 @@ struct Renderer::Impl {
   std::vector<Instance> instances;
   bool dirty = true;
   Eigen::AlignedBox3d region;  // empty: everywhere
-  struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color(), reused
+  struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color()
+  Drawn drawn_color, drawn_depth;
+  cv::Mat depth;             // the last of depth()
+  float lowest_seen = 0.0f;  // m, z of the lowest surface in the last colour image
 
   Impl() : device(rtcNewDevice(nullptr)) {
     if (!device) throw Error("renderer: Embree cannot start on this machine");
@@ -223,6 +259,59 @@ struct Renderer::Impl {
     dirty = true;
   }
 
+  Points corners(const Instance& instance) const {
+    const Eigen::AlignedBox3d& box = meshes[instance.mesh].box;
+    Points corners;
+    for (int i = 0; i < 8; ++i) {
+      const Eigen::Vector3f c =
+          box.corner(static_cast<Eigen::AlignedBox3d::CornerType>(i)).cast<float>();
+      const Vec3 p = instance.R * Vec3{c.x(), c.y(), c.z()} + instance.t;
+      corners.emplace_back(p.x, p.y, p.z);
+    }
+    return corners;
+  }
+
+  // The tiles in which an image may differ from the one that was drawn; it becomes what is drawn.
+  // light: of a colour image, in which objects also shade others.
+  ChangedTiles changes(Drawn& drawn, const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                       const Light* light) const {
+    ChangedTiles tiles(camera, T_base_camera, kTile);
+    bool whole = !drawn.whole || !same(camera, drawn.camera) ||
+                 T_base_camera.matrix() != drawn.T_base_camera.matrix() ||
+                 (light && !same(*light, drawn.light)) ||
+                 drawn.objects.size() != instances.size();
+    drawn.objects.resize(instances.size());
+    const auto mark = [&](const Points& corners) {
+      if (!light) return tiles.mark(corners);
+      const Points reached = shaded(corners, light->position.cast<double>(), light->radius,
+                                    kOcclusionRange, lowest_seen);
+      if (reached.empty()) whole = true;
+      tiles.mark(reached);
+    };
+    for (std::size_t i = 0; i < instances.size(); ++i) {
+      const Instance& instance = instances[i];
+      Drawn::Object& object = drawn.objects[i];
+      Drawn::Object now{instance.mesh, instance.material, instance.visible, corners(instance)};
+      if (!whole) {
+        double moved = 0.0;
+        for (std::size_t k = 0; k < now.corners.size(); ++k)
+          moved = std::max(moved, (now.corners[k] - object.corners[k]).norm());
+        if (moved < kStill && now.mesh == object.mesh && now.visible == object.visible &&
+            same(now.material, object.material))
+          continue;
+        if (object.visible) mark(object.corners);
+        if (now.visible) mark(now.corners);
+      }
+      object = std::move(now);
+    }
+    if (whole) tiles.mark_all();
+    drawn.camera = camera;
+    drawn.T_base_camera = T_base_camera;
+    if (light) drawn.light = *light;
+    drawn.whole = true;
+    return tiles;
+  }
+
   void commit() {
     if (dirty) rtcCommitScene(scene);
     dirty = false;
@@ -246,9 +335,11 @@ struct Renderer::Impl {
     return cv::Rect(first, last) & image;
   }
 
-  // Calls write(u, v, lane, packet) for every pixel of the region after its packet was traced.
+  // Calls write(u, v, lane, packet) for every pixel of the region, or of its changed tiles, after its
+  // packet was traced.
   template <typename Write>
-  void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write) {
+  void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write,
+             const ChangedTiles* changed = nullptr) {
     commit();
     const RayFrame frame(camera, T_base_camera);
     const cv::Rect seen = seen_region(camera, T_base_camera);
@@ -259,6 +350,7 @@ struct Renderer::Impl {
       context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
       Packet packet(frame);
       for (int u = seen.x; u < seen.br().x; u += kTile) {
+        if (changed && !changed->at(first / kTile, u / kTile)) continue;
         packet.aim(frame, camera, u, first);
         rtcIntersect16(packet.valid, scene, &context, &packet.hit);
         for (int i = 0; i < kLanes; ++i)
@@ -341,6 +433,7 @@ int Renderer::add_mesh(const TriangleMesh& mesh) {
   rtcReleaseGeometry(geometry);
   rtcCommitScene(built.scene);
   built.normals = corner_normals(mesh);
+  for (const auto& vertex : mesh.vertices) built.box.extend(vertex.cast<double>());
   impl_->meshes.push_back(std::move(built));
   return static_cast<int>(impl_->meshes.size()) - 1;
 }
@@ -386,6 +479,7 @@ void Renderer::set_material(int instance, const Material& material) {
 
 void Renderer::set_visible(int instance, bool visible) {
   const RTCGeometry geometry = impl_->instance(instance).geometry;
+  impl_->instance(instance).visible = visible;
   visible ? rtcEnableGeometry(geometry) : rtcDisableGeometry(geometry);
   impl_->dirty = true;
 }
@@ -401,14 +495,29 @@ void Renderer::set_region(const Eigen::AlignedBox3d& box) { impl_->region = box;
 cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                         cv::Mat* instances) {
   require_camera(camera);
-  cv::Mat depth(camera.height, camera.width, CV_32FC1, kNaN);
-  if (instances) *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
-  impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
-    const float t = packet.hit.ray.tfar[lane];
-    depth.ptr<float>(v)[u] = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID ? kNaN : t;
-    if (instances) instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
-  });
-  return depth;
+  const auto depth_of = [](const Packet& packet, int lane) {
+    const bool nothing = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID;
+    return nothing ? kNaN : packet.hit.ray.tfar[lane];
+  };
+  if (instances || !impl_->region.isEmpty()) {
+    cv::Mat depth(camera.height, camera.width, CV_32FC1, kNaN);
+    if (instances) *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
+    impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
+      depth.ptr<float>(v)[u] = depth_of(packet, lane);
+      if (instances) instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
+    });
+    return depth;
+  }
+  const ChangedTiles changed = impl_->changes(impl_->drawn_depth, camera, T_base_camera, nullptr);
+  cv::Mat& depth = impl_->depth;
+  depth.create(camera.height, camera.width, CV_32FC1);
+  impl_->trace(
+      camera, T_base_camera,
+      [&](int u, int v, int lane, const Packet& packet) {
+        depth.ptr<float>(v)[u] = depth_of(packet, lane);
+      },
+      &changed);
+  return depth.clone();
 }
 
 cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
@@ -430,15 +539,16 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
   const int width = camera.width, height = camera.height;
   auto& [visibility, direct, ambient, depth, ids, linear] = impl_->frame;
   visibility.create(height, width, CV_8UC1);
-  visibility.setTo(kLit | kOpen);
   direct.create(height, width, CV_32FC3);
   ambient.create(height, width, CV_32FC3);
   linear.create(height, width, CV_32FC3);
   depth.create(height, width, CV_32FC1);
   ids.create(height, width, CV_32SC1);
 
+  const ChangedTiles changed = impl_->changes(impl_->drawn_color, camera, T_base_camera, &light);
   impl_->commit();
   const RayFrame frame(camera, T_base_camera);
+  std::vector<float> lowest((height + kTile - 1) / kTile, impl_->lowest_seen);  // of each tile row
   parallel_rows(height, kTile, [&](int first, int) {
     RTCIntersectContext context, shadow_context;
     rtcInitIntersectContext(&context);
@@ -447,6 +557,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
     Packet packet(frame);
     ShadowPacket lamp, sky;
     for (int u = 0; u < width; u += kTile) {
+      if (!changed.at(first / kTile, u / kTile)) continue;
       packet.aim(frame, camera, u, first);
       rtcIntersect16(packet.valid, impl_->scene, &context, &packet.hit);
       for (int i = 0; i < kLanes; ++i) {
@@ -454,6 +565,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
         sky.skip(i);
         if (!packet.valid[i]) continue;
         const int x = u + i % kTile, y = first + i / kTile;
+        visibility.ptr<std::uint8_t>(y)[x] = kLit | kOpen;
         auto& direct_px = direct.ptr<Vec3>(y)[x];
         auto& ambient_px = ambient.ptr<Vec3>(y)[x];
         ids.ptr<int>(y)[x] = static_cast<int>(packet.hit.hit.instID[0][i]);
@@ -464,6 +576,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
           continue;
         }
         Surface surface = impl_->surface(packet, i);
+        lowest[first / kTile] = std::min(lowest[first / kTile], surface.position.z);
         const Instance& instance = impl_->instances[packet.hit.hit.instID[0][i]];
         const Vec3 origin = surface.position + surface.face_normal * kSurfaceOffset;
         const Vec3 to_lamp = lighting.sample_lamp(i) - origin;
@@ -492,11 +605,14 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
     }
   });
 
+  impl_->lowest_seen = *std::min_element(lowest.begin(), lowest.end());
+
   parallel_rows(height, 16, [&](int first, int last) {
     for (int y = first; y < last; ++y) {
       const int y0 = std::clamp(y - 1, 0, std::max(0, height - kTile));
       const int y1 = std::min(y0 + kTile, height);
       for (int x = 0; x < width; ++x) {
+        if (!changed.at(y / kTile, x / kTile)) continue;
         const int x0 = std::clamp(x - 1, 0, std::max(0, width - kTile));
         const int x1 = std::min(x0 + kTile, width);
         const Vec3 own_direct = direct.ptr<Vec3>(y)[x], own_ambient = ambient.ptr<Vec3>(y)[x];

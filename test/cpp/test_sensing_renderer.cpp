@@ -3,6 +3,9 @@
 
 #include <cmath>
 #include <cstring>
+#include <functional>
+#include <utility>
+#include <vector>
 
 #include "iwgnet_grasp/sensing/pinhole.h"
 #include "iwgnet_grasp/sensing/renderer.h"
@@ -235,6 +238,83 @@ TEST(Color, APrintsEdgeIsSmoothAndInItsPlace) {
     return from - 0.5 + dark - edge;
   };
   for (const double x : {0.0, 0.0007, 0.0013, 0.0021, 0.0029}) EXPECT_NEAR(error(x), 0.1, 0.2) << x;
+}
+
+// A cell of its own for each image, or one whose images follow each other and are drawn anew only
+// where something has changed.
+struct Moving {
+  struct Object {
+    Pose T;
+    Material material;
+    bool visible = true;
+  };
+  Renderer renderer;
+  Pose T_base_camera = at(0, 0, 0.6);
+  Light light{{0.1f, -0.7f, 1.7f}, {1, 1, 1}, 0.4f, 0.1f};
+  std::vector<Object> objects;
+
+  Moving() {
+    T_base_camera.linear() = Eigen::Vector3d(1, -1, -1).asDiagonal();
+    renderer.add_instance(renderer.add_box({2, 2, 0.1}), {}, at(0, 0, -0.05));
+    const int block = renderer.add_box({0.15, 0.04, 0.03}), ball = renderer.add_mesh(sphere(0.04, 12));
+    const int beam = renderer.add_box({0.1, 0.1, 0.5});
+    for (const auto& [mesh, T] : {std::pair(block, at(0.1, 0, 0.015)), {block, at(0.11, 0.02, 0.046)},
+                                  {ball, at(-0.15, 0.05, 0.04)}, {beam, at(0.1, -0.45, 0.65)}}) {
+      objects.push_back({T, {}});
+      renderer.add_instance(mesh, {}, T);
+    }
+  }
+  void put(const std::vector<Object>& as) {
+    objects = as;
+    for (std::size_t i = 0; i < objects.size(); ++i) {
+      const int handle = static_cast<int>(i) + 1;
+      renderer.set_pose(handle, objects[i].T);
+      renderer.set_material(handle, objects[i].material);
+      renderer.set_visible(handle, objects[i].visible);
+    }
+  }
+  cv::Mat color() { return renderer.color(kCamera, T_base_camera, light, 1.0, 3); }
+  cv::Mat depth() { return renderer.depth(kCamera, T_base_camera); }
+};
+
+TEST(Renderer, ImagesAfterAChangeAreThoseOfANewRendererToTheBit) {
+  Moving one;
+  one.color();
+  one.depth();
+  const std::vector<std::pair<const char*, std::function<void(Moving&)>>> changes{
+      {"a block moves", [](Moving& m) { m.objects[0].T = at(0.05, -0.03, 0.015); }},
+      {"the upper block turns in the air", [](Moving& m) {
+         m.objects[1].T = at(0.0, 0.08, 0.2) * Eigen::AngleAxisd(0.7, Eigen::Vector3d(1, 2, 3).normalized());
+       }},
+      {"a beam beside the view moves its shadow", [](Moving& m) { m.objects[3].T = at(0.0, -0.5, 0.7); }},
+      {"a beam passes the camera's height", [](Moving& m) { m.objects[3].T = at(0.15, -0.3, 0.62); }},
+      {"a beam comes to the lamp", [](Moving& m) { m.objects[3].T = at(0.2, -0.6, 1.5); }},
+      {"the ball goes", [](Moving& m) { m.objects[2].visible = false; }},
+      {"the ball comes back, dark", [](Moving& m) {
+         m.objects[2].visible = true;
+         m.objects[2].material.albedo = {0.05f, 0.05f, 0.1f};
+       }},
+      {"the lamp moves", [](Moving& m) { m.light.position.x() = -0.4f; }},
+      {"the camera moves", [](Moving& m) { m.T_base_camera.translation().x() = 0.02; }},
+      {"nothing", [](Moving&) {}},
+  };
+  cv::Mat before = one.color();
+  for (const auto& [name, change] : changes) {
+    change(one);
+    one.put(one.objects);
+    Moving fresh;
+    fresh.light = one.light;
+    fresh.T_base_camera = one.T_base_camera;
+    fresh.put(one.objects);
+    const cv::Mat color = one.color(), depth = one.depth();
+    const cv::Mat expected = fresh.color(), expected_depth = fresh.depth();
+    EXPECT_EQ(std::memcmp(color.data, expected.data, color.total() * 3), 0) << name;
+    EXPECT_EQ(std::memcmp(depth.data, expected_depth.data, depth.total() * 4), 0) << name;
+    EXPECT_EQ(std::memcmp(color.data, before.data, color.total() * 3) == 0,
+              std::string(name) == "nothing")
+        << name;
+    before = color;
+  }
 }
 
 TEST(Renderer, BadInputIsRefused) {

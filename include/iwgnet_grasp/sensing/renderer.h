@@ -26,6 +26,8 @@ struct Light {
   float radius = 0.10f;                         // m, of the lamp; 0 gives hard shadows
 };
 
+// An image after another of the same camera and light is traced anew only where an object that has
+// changed, or has moved by more than 0.1 mm, is or was seen, or shades or shaded what is seen.
 class Renderer {
  public:
   Renderer();
