@@ -335,6 +335,7 @@ void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
     const double open_tip = d.tip + finger_tip_height(d.closed) - finger_tip_height(d.opening);
     double most = 0.0;
     const auto over = [&](const Eigen::Vector2d& half, double underside) {
+      if (heights.highest() + config.floor_clearance <= underside) return;
       const double highest = heights.max_in(axes.center, yaw, half) + config.floor_clearance;
       most = std::max(most, highest - underside);
     };

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <opencv2/imgproc.hpp>
 #include <vector>
 
 #include "iwgnet_grasp/sensing/pinhole.h"
@@ -107,7 +108,8 @@ HeightMap::HeightMap(const cv::Mat& depth, const PinholeIntrinsics& camera,
     }
   }
   fill_unknown(grid_, true);
-  highest_ = *std::max_element(grid_.begin<float>(), grid_.end<float>());
+  cv::minMaxLoc(grid_, nullptr, &highest_);
+  cv::erode(grid_, around_, cv::getStructuringElement(cv::MORPH_CROSS, {3, 3}));
 }
 
 HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& half) const {
@@ -125,8 +127,8 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& h
   const Eigen::Vector3f units(scale, scale, 1.0f);
   const Eigen::Matrix3f R = units.asDiagonal() * T_view_base.linear().cast<float>();
   const Eigen::Vector3f along_column = R.col(0) * step, upwards = R.col(2);
-  const int last_column = grid_.cols - 1, last_row = grid_.rows - 1;
-  for (int r = 0; r <= last_row; ++r) {
+  const int last_column = grid_.cols - 1;
+  for (int r = 0; r < grid_.rows; ++r) {
     const Eigen::Vector3d start(origin_.x(), origin_.y() + r * resolution_, 0.0);
     const Eigen::Vector3f ground = units.cwiseProduct((T_view_base * start).cast<float>()) +
                                    Eigen::Vector3f(half.x() * scale, half.y() * scale, 0.0f);
@@ -144,16 +146,11 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& h
       first = std::max(first, std::min(low / slope, high / slope));
       last = std::min(last, std::max(low / slope, high / slope));
     }
-    const float* row = grid_.ptr<float>(r);
-    const float *before = grid_.ptr<float>(std::max(r - 1, 0)),
-                *after = grid_.ptr<float>(std::min(r + 1, last_row));
+    const float *row = grid_.ptr<float>(r), *around = around_.ptr<float>(r);
     for (int c = static_cast<int>(std::ceil(first)); c <= static_cast<int>(last); ++c) {
       const Eigen::Vector3f at = ground + along_column * static_cast<float>(c);
-      const float top = row[c];
       // Down to the lowest neighbour: the wall of a step is seen from the side.
-      const float low = std::min({top, before[c], after[c], row[std::max(c - 1, 0)],
-                                  row[std::min(c + 1, last_column)]});
-      for (float z = top; z >= low; z -= step) {
+      for (float z = row[c]; z >= around[c]; z -= step) {
         const Eigen::Vector3f p = at + upwards * z;
         if (!(p.x() >= 0.0f && p.y() >= 0.0f && p.x() < columns && p.y() < rows)) continue;
         float& height = view.grid_.ptr<float>(static_cast<int>(p.y()))[static_cast<int>(p.x())];
@@ -162,6 +159,7 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& h
     }
   }
   fill_unknown(view.grid_, false);
+  cv::minMaxLoc(view.grid_, nullptr, &view.highest_);
   return view;
 }
 

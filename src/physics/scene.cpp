@@ -44,12 +44,13 @@ constexpr double kMaxHeight = 0.11;       // m: the D455 sees nothing nearer tha
 
 struct Outline {  // convex outline of a part seen from above, m
   std::vector<Eigen::Vector2d> points;
+  double radius = 0.0;  // of the circle about the origin that holds it
 };
 
 // Convex hull in the plane (Andrew's monotone chain), counter-clockwise.
-Outline outline(const PartModel& model, const Eigen::Matrix3d& R) {
+Outline outline(const std::vector<Eigen::Vector3d>& vertices, const Eigen::Matrix3d& R) {
   std::vector<Eigen::Vector2d> p;
-  for (const auto& v : model.mesh.vertices) p.push_back((R * v.cast<double>()).head<2>());
+  for (const auto& v : vertices) p.push_back((R * v).head<2>());
   std::sort(p.begin(), p.end(), [](const auto& a, const auto& b) {
     return a.x() < b.x() || (a.x() == b.x() && a.y() < b.y());
   });
@@ -68,7 +69,20 @@ Outline outline(const PartModel& model, const Eigen::Matrix3d& R) {
     hull[k++] = p[i];
   }
   hull.resize(k > 1 ? k - 1 : k);
-  return {hull};
+  Outline result{hull};
+  for (const auto& point : hull) result.radius = std::max(result.radius, point.norm());
+  return result;
+}
+
+// The vertices that any outline of a part has which is turned about z or put on its head.
+std::vector<Eigen::Vector3d> rim(const PartModel& model) {
+  std::vector<Eigen::Vector3d> vertices, rim;
+  for (const auto& v : model.mesh.vertices) vertices.push_back(v.cast<double>());
+  const Outline hull = outline(vertices, Eigen::Matrix3d::Identity());
+  for (const auto& v : vertices)
+    if (std::find(hull.points.begin(), hull.points.end(), v.head<2>()) != hull.points.end())
+      rim.push_back(v);
+  return rim;
 }
 
 double distance(const Eigen::Vector2d& p, const Eigen::Vector2d& a, const Eigen::Vector2d& b) {
@@ -79,6 +93,7 @@ double distance(const Eigen::Vector2d& p, const Eigen::Vector2d& a, const Eigen:
 
 bool separated(const Outline& a, const Eigen::Vector2d& at_a, const Outline& b,
                const Eigen::Vector2d& at_b, double gap) {
+  if ((at_a - at_b).norm() > a.radius + b.radius + gap) return true;
   // Apart when some edge normal of either separates them; then the least distance counts.
   bool apart = false;
   double least = 1e9;
@@ -150,14 +165,16 @@ void scatter(World& world, const SceneSpec& spec, const CellConfig& cell,
     Outline shape;
     Eigen::Vector2d at;
   };
+  std::vector<std::vector<Eigen::Vector3d>> rims;
+  for (const auto& model : models) rims.push_back(rim(model));
   for (int layout = 0; layout < kLayouts; ++layout) {
     std::vector<Placed> placed;
-    for (const auto& model : models) {
+    for (const auto& vertices : rims) {
       bool found = false;
       for (int attempt = 0; attempt < kPlacements && !found; ++attempt) {
         Eigen::Matrix3d R = yaw(random.uniform(-M_PI, M_PI));
         if (random.below(2)) R = R * Eigen::AngleAxisd(M_PI, Eigen::Vector3d::UnitX());
-        Placed p{R, outline(model, R), {}};
+        Placed p{R, outline(vertices, R), {}};
         // The whole outline stays inside the workspace.
         Eigen::Vector2d low = p.shape.points[0], high = low;
         for (const auto& v : p.shape.points) {

@@ -17,15 +17,17 @@ class ChangedTiles {
 
   // The tiles that may see the points' convex hull, and their neighbours.
   void mark(const Points& points);
-  void mark_all() { tiles_.setTo(255); }
+  void mark_all() { all_ = true; }
+  bool all() const { return all_; }
   bool at(int tile_row, int tile_column) const {
-    return tiles_.ptr<std::uint8_t>(tile_row)[tile_column];
+    return all_ || tiles_.ptr<std::uint8_t>(tile_row)[tile_column];
   }
 
  private:
   PinholeIntrinsics camera_;
   Pose T_camera_base_;
   int tile_;
+  bool all_ = false;
   cv::Mat tiles_;  // CV_8UC1, 0 or 255
 };
 

@@ -69,8 +69,13 @@ struct Drawn {
   PinholeIntrinsics camera{};
   Pose T_base_camera = Pose::Identity();
   Light light;
+  Eigen::AlignedBox3d region;
   std::vector<Object> objects;
   bool whole = false;  // there is such an image
+
+  bool of(const PinholeIntrinsics& by, const Pose& T) const {
+    return whole && same(by, camera) && T.matrix() == T_base_camera.matrix();
+  }
 };
 
 // Smooth shading: a corner's normal is the mean of the faces around it, weighted by their area,
@@ -215,9 +220,14 @@ struct Renderer::Impl {
   bool dirty = true;
   Eigen::AlignedBox3d region;  // empty: everywhere
   struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color()
-  Drawn drawn_color, drawn_depth;
-  cv::Mat depth;             // the last of depth()
+  Drawn drawn_color;
   float lowest_seen = 0.0f;  // m, z of the lowest surface in the last colour image
+  struct DepthImage {
+    Drawn drawn;
+    cv::Mat depth;
+  };
+  std::array<DepthImage, 2> depth_images;  // of an imager and of the camera that it is aligned to
+  std::size_t oldest_depth = 0;
 
   Impl() : device(rtcNewDevice(nullptr)) {
     if (!device) throw Error("renderer: Embree cannot start on this machine");
@@ -276,9 +286,9 @@ struct Renderer::Impl {
   ChangedTiles changes(Drawn& drawn, const PinholeIntrinsics& camera, const Pose& T_base_camera,
                        const Light* light) const {
     ChangedTiles tiles(camera, T_base_camera, kTile);
-    bool whole = !drawn.whole || !same(camera, drawn.camera) ||
-                 T_base_camera.matrix() != drawn.T_base_camera.matrix() ||
-                 (light && !same(*light, drawn.light)) ||
+    bool whole = !drawn.of(camera, T_base_camera) || (light && !same(*light, drawn.light)) ||
+                 (!light && (region.min() != drawn.region.min() ||
+                             region.max() != drawn.region.max())) ||
                  drawn.objects.size() != instances.size();
     drawn.objects.resize(instances.size());
     const auto mark = [&](const Points& corners) {
@@ -308,6 +318,7 @@ struct Renderer::Impl {
     drawn.camera = camera;
     drawn.T_base_camera = T_base_camera;
     if (light) drawn.light = *light;
+    drawn.region = region;
     drawn.whole = true;
     return tiles;
   }
@@ -495,26 +506,25 @@ void Renderer::set_region(const Eigen::AlignedBox3d& box) { impl_->region = box;
 cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                         cv::Mat* instances) {
   require_camera(camera);
-  const auto depth_of = [](const Packet& packet, int lane) {
-    const bool nothing = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID;
-    return nothing ? kNaN : packet.hit.ray.tfar[lane];
-  };
-  if (instances || !impl_->region.isEmpty()) {
-    cv::Mat depth(camera.height, camera.width, CV_32FC1, kNaN);
-    if (instances) *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
-    impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
-      depth.ptr<float>(v)[u] = depth_of(packet, lane);
-      if (instances) instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
-    });
-    return depth;
+  auto& images = impl_->depth_images;
+  std::size_t k = 0;
+  while (k < images.size() && !images[k].drawn.of(camera, T_base_camera)) ++k;
+  if (k == images.size()) k = impl_->oldest_depth;
+  impl_->oldest_depth = (k + 1) % images.size();
+  auto& [drawn, depth] = images[k];
+  if (instances) {
+    *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
+    drawn.whole = false;  // they are wanted of all pixels
   }
-  const ChangedTiles changed = impl_->changes(impl_->drawn_depth, camera, T_base_camera, nullptr);
-  cv::Mat& depth = impl_->depth;
-  depth.create(camera.height, camera.width, CV_32FC1);
+  const ChangedTiles changed = impl_->changes(drawn, camera, T_base_camera, nullptr);
+  if (changed.all()) depth = cv::Mat(camera.height, camera.width, CV_32FC1, kNaN);
   impl_->trace(
       camera, T_base_camera,
       [&](int u, int v, int lane, const Packet& packet) {
-        depth.ptr<float>(v)[u] = depth_of(packet, lane);
+        const bool nothing = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID;
+        depth.ptr<float>(v)[u] = nothing ? kNaN : packet.hit.ray.tfar[lane];
+        if (instances)
+          instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
       },
       &changed);
   return depth.clone();

@@ -68,6 +68,21 @@ const std::array<float, 1 << kQuantileBits>& normal_quantiles() {
   return table;
 }
 
+// The rectangle of all pixels with a depth.
+cv::Rect known(const cv::Mat& depth) {
+  cv::Rect known;
+  for (int v = 0; v < depth.rows; ++v) {
+    const float *row = depth.ptr<float>(v), *end = row + depth.cols;
+    const auto is_depth = [](float z) { return z > 0.0f; };
+    const float* first = std::find_if(row, end, is_depth);
+    if (first == end) continue;
+    const float* last = end - 1;
+    while (!is_depth(*last)) --last;
+    known |= cv::Rect(static_cast<int>(first - row), v, static_cast<int>(last - first) + 1, 1);
+  }
+  return known;
+}
+
 }  // namespace
 
 double depth_from_disparity(double disparity_px, double fx_px, double baseline_m) {
@@ -89,12 +104,16 @@ cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
   const auto outliers = static_cast<std::uint64_t>(camera.outlier_fraction * (1 << 22));
   const std::uint64_t stream = mix(seed);
 
-  cv::Mat measured(height, width, CV_32FC1);
-  parallel_rows(height, 16, [&](int first, int last) {
-    for (int v = first; v < last; ++v) {
+  cv::Mat measured(height, width, CV_32FC1, kNaN);
+  // Beside it nothing is measured: the renderer may have traced a part of the image only.
+  const int off = cvCeil(lateral * normal.back());
+  cv::Rect seen = known(ideal_left);
+  seen = cv::Rect(seen.tl() - cv::Point(off, off), seen.br() + cv::Point(off, off)) &
+         cv::Rect(0, 0, width, height);
+  parallel_rows(seen.height, 16, [&](int first, int last) {
+    for (int v = seen.y + first; v < seen.y + last; ++v) {
       float* out = measured.ptr<float>(v);
-      for (int u = 0; u < width; ++u) {
-        out[u] = kNaN;
+      for (int u = seen.x; u < seen.br().x; ++u) {
         // 14 bits each for three normal draws, 22 bits for the outlier.
         const std::uint64_t bits = mix(stream + static_cast<std::uint64_t>(v) * width + u);
         const auto draw = [&](int i) {

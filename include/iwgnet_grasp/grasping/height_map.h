@@ -41,6 +41,7 @@ class HeightMap {
 
  private:
   cv::Mat grid_;
+  cv::Mat around_;  // of a map from an image: the lowest of each cell and its four neighbours
   Eigen::Vector2d origin_{0, 0};
   double resolution_ = 0.002, outside_ = 0.0;
   double highest_ = 0.0;
