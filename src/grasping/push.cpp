@@ -15,6 +15,7 @@ const Eigen::Vector2d kTips(0.013, 0.013), kFingers(0.040, 0.024), kBody(0.048, 
 constexpr double kFingersAbove = 0.035, kBodyAbove = 0.060;
 constexpr double kAhead = 0.08;      // m beyond the push's end that count as in its way
 constexpr double kHalfWidth = 0.03;  // m of what counts
+constexpr double kNeighbour = 0.10;  // m between centroids, of objects that may go along
 
 }  // namespace
 
@@ -27,6 +28,10 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
   std::vector<Candidate> candidates;
   const Eigen::Vector2d low = cell.workspace_min.array() + config.margin,
                         high = cell.workspace_max.array() - config.margin;
+  // m that a point lies outside.
+  const auto outside = [&](const Eigen::Vector2d& p) {
+    return (low - p).cwiseMax(p - high).cwiseMax(0.0).norm();
+  };
   // Against one object in one direction, the tips `tip` over the table.
   const auto try_push = [&](const Eigen::Vector2d& center, const Eigen::Vector2d& along, double tip) {
     const double closing = std::atan2(along.y(), along.x()) + M_PI / 2;
@@ -43,9 +48,15 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
     double met = 0.0;  // m, at the centroid at the latest
     while (met < back && free(from + met * along, kTips, 0.0)) met += kStep;
     double way = met;
+    // Neighbours may be entangled with the object and go as far as it does. One that lies outside
+    // already may come back.
+    const auto stays = [&](const Eigen::Vector3d& object) {
+      const Eigen::Vector2d p = object.head<2>();
+      return (p - center).norm() > kNeighbour ||
+             outside(p + (way - met + kStep) * along) <= outside(p + (way - met) * along);
+    };
     const auto goes_on = [&] {
-      const Eigen::Vector2d end = center + (way - met + kStep) * along;
-      return (end.array() >= low.array()).all() && (end.array() <= high.array()).all() &&
+      return std::all_of(objects.begin(), objects.end(), stays) &&
              free(from + (way + kStep) * along, kBody, kBodyAbove);
     };
     while (way - met < config.distance && goes_on()) way += kStep;

@@ -71,6 +71,23 @@ TEST(Push, KeepsTheObjectInTheWorkspaceAndTheGripperOffWhatIsHigh) {
   EXPECT_TRUE(tower.pushes({{0.5, 0.0, 0.15}}).empty());
 }
 
+TEST(Push, KeepsNeighboursInTheWorkspaceAndBringsBackWhatIsOutside) {
+  Table table;
+  const double rim = table.cell.workspace_max.x() - 0.02, inner = rim - 0.06;
+  table.add(inner, 0.0, {0.02, 0.02, 0.02});
+  table.add(rim, 0.0, {0.02, 0.02, 0.02});
+  const auto pushes = table.pushes({{inner, 0.0, 0.02}, {rim, 0.0, 0.02}});
+  ASSERT_FALSE(pushes.empty());
+  for (const Push& push : pushes) EXPECT_LT((push.to - push.from).normalized().x(), 0.2);
+
+  Table lost;
+  const double beyond = lost.cell.workspace_max.x() + 0.05;
+  lost.add(beyond, 0.0, {0.02, 0.02, 0.02});
+  const auto back = lost.pushes({{beyond, 0.0, 0.02}});
+  ASSERT_FALSE(back.empty());
+  for (const Push& push : back) EXPECT_LE((push.to - push.from).normalized().x(), 1e-9);
+}
+
 TEST(Push, LeavesWhatLiesBelowTheObject) {
   Table table;  // one bar across another
   table.add(kMiddle.x(), kMiddle.y(), {0.02, 0.16, 0.02});

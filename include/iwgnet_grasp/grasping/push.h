@@ -15,7 +15,7 @@ struct PushConfig {       // config/motion.yaml, section "push"
   double run_up;          // m from the object's centroid at most, to where they go down
   double distance, min_distance;  // m that the fingers go on once they meet something, as far as the
                                   // workspace lets them, and what is worth it
-  double margin;          // m, the object's centroid stays so far inside the workspace
+  double margin;          // m, the object's centroid and its neighbours' stay so far inside the workspace
   double speed;           // m/s of the tool
 };
 
@@ -27,8 +27,8 @@ struct Push {
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
 // room, nearest to the object in each of 16 directions, at the greatest height that still meets it, as
-// far as what is there is not so high that the gripper's body would touch it and the object stays in
-// the workspace. The highest first, then those with the least in their way: what lies on others slides
+// far as what is there is not so high that the gripper's body would touch it and the object and its
+// neighbours, which may go along, stay in the workspace or, from outside, come nearer. The highest first, then those with the least in their way: what lies on others slides
 // off them, and an object moves away from its neighbours rather than into them.
 std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
                               const CellConfig& cell, const PushConfig& config);
