@@ -497,6 +497,8 @@ void Renderer::set_visible(int instance, bool visible) {
 
 void Renderer::clear_instances() {
   impl_->drop_instances();
+  impl_->drawn_color.whole = false;  // a scene's images do not depend on the scene before
+  for (auto& image : impl_->depth_images) image.drawn.whole = false;
   rtcReleaseScene(impl_->scene);
   impl_->new_scene();
 }

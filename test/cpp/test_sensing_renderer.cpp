@@ -317,6 +317,20 @@ TEST(Renderer, ImagesAfterAChangeAreThoseOfANewRendererToTheBit) {
   }
 }
 
+TEST(Renderer, ImagesOfASceneDoNotDependOnTheSceneBefore) {
+  const auto image = [](Renderer& renderer, double x) {
+    renderer.clear_instances();
+    renderer.add_instance(0, {}, at(x, 0, 0.5) * Eigen::AngleAxisd(0.5, Eigen::Vector3d::UnitY()));
+    return renderer.depth(kCamera, Pose::Identity());
+  };
+  Renderer first, second;
+  for (Renderer* renderer : {&first, &second}) renderer->add_box({0.1, 0.1, 0.1});
+  const double hair = 5e-5;  // m, less than what makes an object of the same scene be drawn anew
+  image(first, 0.0);
+  const cv::Mat a = image(first, hair), b = image(second, hair);
+  EXPECT_EQ(std::memcmp(a.data, b.data, a.total() * 4), 0);
+}
+
 TEST(Renderer, BadInputIsRefused) {
   Renderer renderer;
   EXPECT_THROW(renderer.add_mesh({}), Error);
