@@ -40,7 +40,9 @@ btScalar ContactSolver::solveSingleIteration(int iteration, btCollisionObject** 
         iteration, bodies, body_count, manifolds, manifold_count, constraints, constraint_count,
         info, drawer);
   double residual = 0.0;
-  if (m_tmpSolverContactConstraintPool.size() > 0 || m_tmpSolverNonContactConstraintPool.size() > 0) {
+  const bool among_bodies = m_tmpSolverContactConstraintPool.size() > 0 ||
+                            m_tmpSolverNonContactConstraintPool.size() > 0;
+  if (among_bodies) {
     residual = btSequentialImpulseConstraintSolver::solveSingleIteration(
         iteration, bodies, body_count, manifolds, manifold_count, constraints, constraint_count,
         info, drawer);
@@ -51,8 +53,7 @@ btScalar ContactSolver::solveSingleIteration(int iteration, btCollisionObject** 
   const int count = static_cast<int>(rows_.size()), frictions = joints_ + normals_;
   for (int i = joints_; i < frictions; ++i) note(resolve(i));
   for (int i = frictions; i < count; i += 2) note(resolve_cone(i));
-  if (m_tmpSolverContactConstraintPool.size() > 0 || m_tmpSolverNonContactConstraintPool.size() > 0)
-    give_to_bodies();
+  if (among_bodies) give_to_bodies();
   return residual;
 }
 

@@ -12,14 +12,14 @@ constexpr double kNear = 0.01;       // m, in front of the camera: hulls are cut
 constexpr double kFarAway = 30000;   // px, drawn beyond the image's edges
 constexpr double kBelowLamp = 0.05;  // m, least height of the lamp over what it shines on
 
+}  // namespace
+
 Points corners_of(const Eigen::AlignedBox3d& box) {
   Points corners;
   for (int i = 0; i < 8; ++i)
     corners.push_back(box.corner(static_cast<Eigen::AlignedBox3d::CornerType>(i)));
   return corners;
 }
-
-}  // namespace
 
 ChangedTiles::ChangedTiles(const PinholeIntrinsics& camera, const Pose& T_base_camera, int tile)
     : camera_(camera),

@@ -10,6 +10,8 @@ namespace iwgnet_grasp::sensing {
 
 using Points = std::vector<Eigen::Vector3d>;  // m, base_link
 
+Points corners_of(const Eigen::AlignedBox3d& box);
+
 class ChangedTiles {
  public:
   // tile: px, side of the squares that are marked.

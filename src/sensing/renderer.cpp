@@ -270,13 +270,11 @@ struct Renderer::Impl {
   }
 
   Points corners(const Instance& instance) const {
-    const Eigen::AlignedBox3d& box = meshes[instance.mesh].box;
-    Points corners;
-    for (int i = 0; i < 8; ++i) {
-      const Eigen::Vector3f c =
-          box.corner(static_cast<Eigen::AlignedBox3d::CornerType>(i)).cast<float>();
+    Points corners = corners_of(meshes[instance.mesh].box);
+    for (Eigen::Vector3d& corner : corners) {
+      const Eigen::Vector3f c = corner.cast<float>();
       const Vec3 p = instance.R * Vec3{c.x(), c.y(), c.z()} + instance.t;
-      corners.emplace_back(p.x, p.y, p.z);
+      corner = {p.x, p.y, p.z};
     }
     return corners;
   }
@@ -334,9 +332,8 @@ struct Renderer::Impl {
     if (region.isEmpty()) return image;
     const Pose T_camera_base = T_base_camera.inverse();
     Eigen::AlignedBox2d seen;
-    for (int i = 0; i < 8; ++i) {
-      const Eigen::Vector3d p =
-          T_camera_base * region.corner(static_cast<Eigen::AlignedBox3d::CornerType>(i));
+    for (const Eigen::Vector3d& corner : corners_of(region)) {
+      const Eigen::Vector3d p = T_camera_base * corner;
       if (!(p.z() > 0)) return image;  // beside or behind the camera: no rectangle bounds it
       seen.extend(project(camera, p));
     }
