@@ -1,8 +1,10 @@
 """Files on disk."""
 
+import contextlib
 import errno
+import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,6 +31,22 @@ def write_whole(path: Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def sole_writer(folder: Path, refusal: type[Exception]) -> Iterator[None]:
+    """Makes the folder and locks it as long as the block lasts. Raises `refusal` when another
+    process has it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise refusal(f"{folder}: another run is writing it; wait or choose another") from None
+        yield
+    finally:
+        os.close(handle)
 
 
 def read_config(

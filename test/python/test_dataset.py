@@ -29,13 +29,13 @@ from iwgnet_grasp.data.generate import (
     as_detected,
     bounding_box,
     generate_dataset,
-    sole_writer,
 )
 from iwgnet_grasp.data.grasp_rectangle import JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_jacquard
 from iwgnet_grasp.data.lift_check import plan_check, require_stored, summary
 from iwgnet_grasp.data.mask_dataset import find_masks, load_mask_views
+from iwgnet_grasp.files import sole_writer
 from iwgnet_grasp.parts.library import add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
 
@@ -56,7 +56,7 @@ def dataset(tmp_path_factory):
 def files(root: Path) -> list[str]:
     """All files of a set but those that tell of the run."""
     names = (str(p.relative_to(root)) for p in root.rglob("*") if p.is_file())
-    return sorted(set(names) - {".lock", "lifts.json", "dataset.json"})
+    return sorted(set(names) - {"lifts.json", "dataset.json"})
 
 
 def command(out: Path, *arguments: str, limit_bytes: int = 0) -> subprocess.Popen:
@@ -367,7 +367,7 @@ def test_detected_boxes_stay_near_the_true_one_and_in_the_image():
 
 def test_two_runs_do_not_write_into_one_folder(tmp_path):
     with (
-        sole_writer(tmp_path),
+        sole_writer(tmp_path, DataError),
         pytest.raises(DataError, match="another run"),
     ):
         generate_dataset(1, SEED, tmp_path, ["connecting_rod"], 1, quiet=True)

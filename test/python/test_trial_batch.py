@@ -14,6 +14,7 @@ import pytest
 from test_trial_statistics import pick, record
 
 from iwgnet_grasp.cluster import ClusterError, connect
+from iwgnet_grasp.files import sole_writer
 from iwgnet_grasp.overrides import changed_config
 from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials import batch
@@ -131,6 +132,14 @@ def test_a_folder_with_something_else_is_refused(tmp_path, table):
     with pytest.raises(BatchError, match="not empty"):
         run_trials(RUN, tmp_path)
     assert not table.ran
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path, table):
+    run_trials(RUN, tmp_path)
+    with sole_writer(tmp_path, BatchError), pytest.raises(BatchError, match="another run is writ"):
+        run_trials(replace(RUN, trials=3), tmp_path)
+    assert table.ran == RUN.tasks()
+    assert read_run(tmp_path) == RUN
 
 
 def test_a_run_of_no_trial_or_of_a_negative_seed_is_none():

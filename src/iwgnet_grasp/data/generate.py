@@ -16,9 +16,7 @@ with, on any number of workers.
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import fcntl
 import io
 import json
 import shutil
@@ -40,7 +38,7 @@ from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, TH
 from iwgnet_grasp.data.jacquard import format_grasps
 from iwgnet_grasp.data.lift_check import as_text, plan_check, require_stored, summary
 from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
-from iwgnet_grasp.files import disk_error, write_whole
+from iwgnet_grasp.files import disk_error, sole_writer, write_whole
 from iwgnet_grasp.overrides import OverrideError, changed_config, parse_overrides
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
@@ -530,7 +528,7 @@ def generate_dataset(
         "settings": settings,
     }
     try:
-        with sole_writer(out):
+        with sole_writer(out, DataError):
             description = open_dataset(out, description)
             try:
                 _fill(description, out, kind, workers, address, package_dir, lift_check, quiet)
@@ -552,18 +550,6 @@ def changed_settings(changes: Sequence[str]) -> dict:
             return dict(yaml.safe_load((folder / CONFIG.name).read_text()))
     except OverrideError as error:
         raise DataError(str(error)) from None
-
-
-@contextlib.contextmanager
-def sole_writer(out: Path) -> Iterator[None]:
-    """Holds the folder's lock. DataError when another run has it."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise DataError(f"{out}: another run is writing it; wait or choose another") from None
-        yield
 
 
 def _fill(

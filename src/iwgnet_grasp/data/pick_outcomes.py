@@ -28,7 +28,7 @@ import typer
 import yaml
 
 from iwgnet_grasp.data.errors import DataError
-from iwgnet_grasp.files import disk_error, write_whole
+from iwgnet_grasp.files import disk_error, sole_writer, write_whole
 from iwgnet_grasp.perception.types import Box, CameraIntrinsics
 from iwgnet_grasp.progress import progress_bar
 
@@ -248,7 +248,7 @@ def make_picks(
 ) -> int:
     """Makes the piles 0 .. piles-1 that are not there yet; returns how many the folder then holds.
     workers, address: as for data.generate.generate_dataset. DataError."""
-    from iwgnet_grasp.data.generate import CONFIG, sole_writer, write_json
+    from iwgnet_grasp.data.generate import CONFIG, write_json
     from iwgnet_grasp.data.scene_pool import SceneKind, library_digest, open_pool
 
     settings = yaml.safe_load(CONFIG.read_text())
@@ -256,7 +256,7 @@ def make_picks(
     kind = SceneKind(FAMILIES, settings, library)
     description = {"seed": seed, "piles": piles, "library": library, "settings": settings}
     try:
-        with sole_writer(out):
+        with sole_writer(out, DataError):
             old = describe_picks(out) if any(out.glob("[0-9]*.npz")) else description
             if any(old.get(key) != description[key] for key in ("seed", "library", "settings")):
                 raise DataError(

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import yaml
 
+from iwgnet_grasp.files import sole_writer
 from iwgnet_grasp.overrides import changed_config
 from iwgnet_grasp.trials.pool import Task, run_here, run_with_ray
 from iwgnet_grasp.trials.record import write_json
@@ -67,31 +68,31 @@ def run_trials(
     """Runs what is still to be run; returns the summary, which is also in out/summary.json.
 
     on_start is told the trials that the folder holds already, on_record each new one, `say` what
-    else a person should know. Raises BatchError for a folder of another run, PoolError or
-    CellError when trials cannot go on; what was finished stays in the folder, also after
-    KeyboardInterrupt.
+    else a person should know. Raises BatchError for a folder of another run or one
+    that another process writes, PoolError or CellError when trials cannot go on; what was
+    finished stays in the folder, also after KeyboardInterrupt.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    _claim(out, run)
-    records = read_records(out)
-    on_start(records)
-    done = {(record["scene"], record["seed"]) for record in records}
-    tasks = [task for task in run.tasks() if task not in done]
-    commit = _commit()
-    try:
-        if tasks:
-            with (out / "trials.jsonl").open("a") as file:
-                for record in _records(run.conditions, tasks, out, workers, address, say):
-                    record["commit"] = commit
-                    file.write(json.dumps(record, allow_nan=False) + "\n")
-                    file.flush()
-                    os.fsync(file.fileno())
-                    records.append(record)
-                    on_record(record)
-    finally:
-        result = {"run": _as_json(run), **summary(records, run.scenes)}
-        write_json(out / "summary.json", result)
-    return result
+    with sole_writer(out, BatchError):
+        _claim(out, run)
+        records = read_records(out)
+        on_start(records)
+        done = {(record["scene"], record["seed"]) for record in records}
+        tasks = [task for task in run.tasks() if task not in done]
+        commit = _commit()
+        try:
+            if tasks:
+                with (out / "trials.jsonl").open("a") as file:
+                    for record in _records(run.conditions, tasks, out, workers, address, say):
+                        record["commit"] = commit
+                        file.write(json.dumps(record, allow_nan=False) + "\n")
+                        file.flush()
+                        os.fsync(file.fileno())
+                        records.append(record)
+                        on_record(record)
+        finally:
+            result = {"run": _as_json(run), **summary(records, run.scenes)}
+            write_json(out / "summary.json", result)
+        return result
 
 
 def read_summary(out: Path) -> dict:
