@@ -16,6 +16,9 @@ import yaml
 
 from iwgnet_grasp.perception.types import GraspRectangle
 
+# Reasons of an Outcome that are found before the arm moves: nothing was attempted.
+NOT_EXECUTED = ("infeasible", "unreachable", "no_plan")
+
 
 @dataclass(frozen=True)
 class Target:
@@ -135,6 +138,7 @@ class Cycle:
     attempts_used_up."""
 
     attempts: list[Attempt] = field(default_factory=list)
+    set_aside: list[Attempt] = field(default_factory=list)  # no motion was found, nothing moved
     failed: list[GraspRectangle] = field(default_factory=list)
     looks: int = 0
     pushes: int = 0
@@ -145,7 +149,8 @@ def pick_line(number: int, attempt: Attempt) -> str:
     """The line a person reads after each pick."""
     target, outcome = attempt.target, attempt.outcome
     grasp = target.grasp
-    verdict = "picked" if outcome.success else f"failed ({outcome.reason})"
+    failed = "set aside" if outcome.reason in NOT_EXECUTED else "failed"
+    verdict = "picked" if outcome.success else f"{failed} ({outcome.reason})"
     note = f": {outcome.message}" if outcome.message and not outcome.success else ""
     return (
         f"pick {number:2d}  look {target.scene_id:2d} object {target.object_id:2d} {target.label}"
@@ -171,8 +176,9 @@ def clear_table(
     cycle: Cycle | None = None,
 ) -> Cycle:
     """Runs the cycle until nothing is detected any more, nothing is graspable or the attempts are
-    used up. Fills `cycle` as it goes, so that a caller keeps what was done when an exception
-    (CellError, KeyboardInterrupt) ends it early."""
+    used up. A grasp for which no motion is found is set aside before anything moves, and the next
+    best of the same look is taken. Fills `cycle` as it goes, so that a caller keeps what was done
+    when an exception (CellError, KeyboardInterrupt) ends it early."""
     cycle = Cycle() if cycle is None else cycle
     idle_looks = 0
     pushes = 0  # since the last pick
@@ -210,18 +216,21 @@ def clear_table(
             target = graspable[0]
             start = cell.time()
             outcome = cell.execute(target, slot % settings.tray_slots)
-            cycle.attempts.append(Attempt(target, outcome, slot, start, cell.time()))
-            say(pick_line(len(cycle.attempts), cycle.attempts[-1]))
-            tried.add(target.object_id)
+            attempt = Attempt(target, outcome, slot, start, cell.time())
+            executed = outcome.reason not in NOT_EXECUTED
+            (cycle.attempts if executed else cycle.set_aside).append(attempt)
+            say(pick_line(len(cycle.attempts) + (not executed), attempt))
+            if executed:
+                tried.add(target.object_id)
             if outcome.success:
                 slot += 1
                 taken.append(target.object_id)
             else:
                 cycle.failed.append(target.grasp)
-            if len(cycle.attempts) >= settings.max_attempts:
+            if len(cycle.attempts) + len(cycle.set_aside) >= settings.max_attempts:
                 cycle.ended = "attempts_used_up"
                 return cycle
-            if settings.replan == "every":
+            if settings.replan == "every" and executed:
                 break
             targets = cell.plan(scene_id, cycle.failed, taken)
             left = [t for t in targets if t.object_id not in tried]

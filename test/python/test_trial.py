@@ -25,8 +25,11 @@ class Table:
     """A Cell whose objects need a given number of tries; None: no grasp on it ever is feasible.
     Their grasps have a quality of 1, after each push that of the next of `qualities`."""
 
-    def __init__(self, tries, fatal_pick=None, error=None, qualities=(1.0,), pushes=True):
+    def __init__(
+        self, tries, fatal_pick=None, error=None, qualities=(1.0,), pushes=True, no_way_to=()
+    ):
         self.tries = dict(enumerate(tries))
+        self.no_way_to = list(no_way_to)  # objects, for the first grasp on each
         self.clock = 0.0
         self.looks = 0
         self.executed = []
@@ -60,6 +63,9 @@ class Table:
     def execute(self, target, tray_slot):
         if self.fatal_pick is not None and len(self.executed) == self.fatal_pick:
             raise self.error
+        if target.object_id in self.no_way_to:
+            self.no_way_to.remove(target.object_id)
+            return Outcome(False, "no_plan", "way to the tray: no path")
         self.executed.append((target.object_id, tray_slot))
         self.clock += PICK_SECONDS
         self.tries[target.object_id] -= 1
@@ -166,6 +172,25 @@ def test_a_failed_grasp_is_told_to_the_next_plan_and_its_tray_slot_is_used_again
     assert table.executed == [(0, 0), (0, 0), (1, 1)]
     assert table.failed_seen[0] == []
     assert table.failed_seen[1] == [cycle.attempts[0].target.grasp]
+
+
+@pytest.mark.parametrize("replan", ["once", "every"])
+def test_a_grasp_without_a_motion_is_set_aside_and_is_no_attempt(replan, tmp_path):
+    table = Table([1, 1], no_way_to=[0, 0])
+    trial = trial_of(table, tmp_path, replan)
+    cycle = trial.cycle
+    assert table.executed == [(0, 0), (1, 1)] and trial.success
+    assert table.failed_seen[2] == [a.target.grasp for a in cycle.set_aside]
+    assert cycle.attempts[0].target.scene_id == 1  # of the same look
+    written = json.loads((tmp_path / "trial.json").read_text())
+    assert [entry["reason"] for entry in written["set_aside"]] == ["no_plan", "no_plan"]
+    assert len(written["picks"]) == 2
+
+
+def test_grasps_that_are_set_aside_are_bounded_too():
+    settings = load_settings(CONFIG, replan="every", max_attempts=5)
+    cycle = clear_table(Table([1], no_way_to=[0] * 9), settings, quiet)
+    assert cycle.ended == "attempts_used_up" and len(cycle.set_aside) == 5
 
 
 def test_the_cycle_gives_up_when_nothing_is_graspable():

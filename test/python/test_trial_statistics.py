@@ -67,6 +67,9 @@ def test_causes_are_named_in_order_of_time_and_only_for_failed_trials():
 def test_parts_that_stay_are_not_detected_or_without_a_grasp():
     assert causes(record([pick()], objects=2)) == ["not detected"]
     assert causes(record([pick()], objects=2, ended="nothing_graspable")) == ["no grasp"]
+    aside = [pick(False, "no_plan"), pick(False, "unreachable")]
+    stuck = record([pick()], objects=2, ended="nothing_graspable", set_aside=aside)
+    assert causes(stuck) == ["unreachable"]
     assert causes(record([pick()], objects=2, on_table=0, lost=1)) == ["knocked away"]
 
 

@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from iwgnet_grasp.perception.types import GraspRectangle
+from iwgnet_grasp.supervisor import NOT_EXECUTED
 
 PACKAGE = Path(__file__).resolve().parents[3]
 LIFTED = "lifted"
-# The arm did not set out: nothing was learnt about the grip itself.
-NOT_EXECUTED = ("infeasible", "unreachable", "no_plan")
 
 
 @dataclass(frozen=True)

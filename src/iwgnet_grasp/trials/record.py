@@ -60,6 +60,7 @@ class Trial:
             "lost": verdict.get("lost"),
             "collisions": verdict.get("collisions", []),
             "picks": [pick_entry(a, self.verdict) for a in self.cycle.attempts],
+            "set_aside": [pick_entry(a, None) for a in self.cycle.set_aside],
             "looks": self.cycle.looks,
             "pushes": self.cycle.pushes,
             "ended": "error" if self.error else self.cycle.ended,

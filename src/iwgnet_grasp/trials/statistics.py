@@ -45,15 +45,15 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
+def _cause(reason: str) -> str:
+    return _CAUSE_OF_REASON.get(reason, reason)
+
+
 def causes(record: Record) -> list[str]:
     """Why a trial failed, in order of time; empty for a successful one."""
     if record["success"]:
         return []
-    found = [
-        _CAUSE_OF_REASON.get(pick["reason"], pick["reason"])
-        for pick in record["picks"]
-        if not pick["success"]
-    ]
+    found = [_cause(pick["reason"]) for pick in record["picks"] if not pick["success"]]
     if record["collisions"] and "collided" not in found:
         found.append("collided")  # outside of a pick
     if record["error"]:
@@ -62,7 +62,10 @@ def causes(record: Record) -> list[str]:
         found.append("knocked away")
     if record["on_table"] and record["ended"] == "cleared":
         found.append("not detected")
-    if record["on_table"] and record["ended"] == "nothing_graspable":
+    set_aside = record.get("set_aside")  # no motion was found for them
+    if record["on_table"] and set_aside and not found:
+        found.append(_cause(set_aside[-1]["reason"]))
+    elif record["on_table"] and record["ended"] == "nothing_graspable":
         found.append("no grasp")
     if record["on_table"] and not found:  # one look and one sequence did not hold every object
         found.append("not detected")
@@ -94,6 +97,7 @@ def summarise(records: Sequence[Record]) -> dict:
         "attempts": len(picks),
         "good_attempts": len(good),
         "pushes": sum(record.get("pushes", 0) for record in records),
+        "set_aside": sum(len(record.get("set_aside", [])) for record in records),
         "gsr": _ratio(len(good), len(picks)),
         "gsr_interval_95": list(wilson_interval(len(good), len(picks))),
         "objects": objects,

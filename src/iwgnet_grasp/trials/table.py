@@ -12,7 +12,17 @@ Rows = list[list[str]]
 
 def success_rows(summary: dict) -> tuple[list[str], Rows]:
     """Head and rows: a scene a row, the paper's figure beside ours."""
-    head = ["scene", "success", "rate", "95 % interval", "paper", "attempts", "GSR", "pushes"]
+    head = [
+        "scene",
+        "success",
+        "rate",
+        "95 % interval",
+        "paper",
+        "attempts",
+        "GSR",
+        "pushes",
+        "set aside",
+    ]
     head += ["cleared", "picks/h", "slip mm", "slip deg", "placement mm"]
     head += ["simulated s", "wall s", "x real"]
     rows = []
@@ -148,7 +158,8 @@ def _speed_and_care(s: dict) -> list[str]:
     return [
         f"{s['good_attempts']}/{s['attempts']}",
         percent(s["gsr"]),
-        str(s.get("pushes", 0)),  # none in the summary of an older run
+        str(s.get("pushes", 0)),  # neither is in the summary of an older run
+        str(s.get("set_aside", 0)),
         percent(s["cleared"]),
         number(s["picks_per_hour"]),
         spread(s["slip_mm"]),
