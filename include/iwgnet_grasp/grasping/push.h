@@ -26,10 +26,11 @@ struct Push {
 };
 
 // All pushes against the objects (centroids in base_link, m): from a place where the fingers find
-// room, nearest to the object in each of 16 directions, at the greatest height that still meets it, as
-// far as what is there is not so high that the gripper's body would touch it and the object and its
-// neighbours, which may go along, stay in the workspace or, from outside, come nearer. The highest first, then those with the least in their way: what lies on others slides
-// off them, and an object moves away from its neighbours rather than into them.
+// room, nearest to the object in each of 16 directions, at the greatest height that still meets it,
+// as far as what is there is not so high that the gripper's body would touch it and the object and
+// its neighbours, which may go along, stay in the workspace or, from outside, come nearer. The
+// highest first, then those with the least in their way: what lies on others slides off them, and an
+// object moves away from its neighbours rather than into them.
 std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen::Vector3d>& objects,
                               const CellConfig& cell, const PushConfig& config);
 
