@@ -1,4 +1,6 @@
-"""The bar of long work: how much is done, since when, and how long it will still take."""
+"""Long work: how much is done, since when, how long it will still take, and how it is stopped."""
+
+import signal
 
 from rich.progress import (
     BarColumn,
@@ -20,3 +22,14 @@ def progress_bar(quiet: bool = False) -> Progress:
         TimeRemainingColumn(),
         disable=quiet,
     )
+
+
+def interrupt_on(*signals: signal.Signals) -> None:
+    """Makes KeyboardInterrupt of these signals: a shell starts what runs in its background with
+    SIGINT ignored, and SIGTERM would end a process without any clearing up."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    for number in signals:
+        signal.signal(number, interrupt)

@@ -43,7 +43,7 @@ from iwgnet_grasp.overrides import OverrideError, changed_config, parse_override
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
 from iwgnet_grasp.perception.merged_depth import crop_window
 from iwgnet_grasp.perception.types import Box, Window
-from iwgnet_grasp.progress import progress_bar
+from iwgnet_grasp.progress import interrupt_on, progress_bar
 
 PACKAGE = Path(__file__).resolve().parents[3]
 CONFIG = PACKAGE / "config" / "dataset.yaml"
@@ -683,11 +683,7 @@ def generate(
     if families is None and not mesh:
         names = ["connecting_rod"]
 
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, stop)  # a shell may have started it with SIGINT ignored
-    signal.signal(signal.SIGTERM, stop)
+    interrupt_on(signal.SIGINT, signal.SIGTERM)
     try:
         for path in mesh or []:
             part = part_from_mesh(path, path.stem, mesh_unit, density=mesh_density)

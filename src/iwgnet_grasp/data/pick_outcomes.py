@@ -30,7 +30,7 @@ import yaml
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.files import disk_error, sole_writer, write_whole
 from iwgnet_grasp.perception.types import Box, CameraIntrinsics
-from iwgnet_grasp.progress import progress_bar
+from iwgnet_grasp.progress import interrupt_on, progress_bar
 
 if TYPE_CHECKING:
     from iwgnet_grasp.data.generate import SceneMaker
@@ -322,12 +322,7 @@ def pick(
 
     A run that was stopped goes on with the same command.
     """
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, stop)  # a shell may have started it with SIGINT ignored
-    signal.signal(signal.SIGTERM, stop)
+    interrupt_on(signal.SIGINT, signal.SIGTERM)
     try:
         made = make_picks(piles, seed, out, workers, address)
     except KeyboardInterrupt:

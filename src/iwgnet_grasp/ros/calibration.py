@@ -35,6 +35,7 @@ from iwgnet_grasp.calibration.settings import (
     load_settings,
 )
 from iwgnet_grasp.calibration.solve import Calibration, compare, solve
+from iwgnet_grasp.progress import interrupt_on
 from iwgnet_grasp.ros.session import Session
 from iwgnet_grasp.supervisor import CellError
 
@@ -482,11 +483,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rviz-picture", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on(signal.SIGTERM)
     try:
         run(options, load_settings())
     except KeyboardInterrupt:

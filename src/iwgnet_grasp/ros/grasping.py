@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from iwgnet_grasp.progress import interrupt_on
 from iwgnet_grasp.ros.session import Session
 from iwgnet_grasp.supervisor import CellError, Settings, load_settings
 from iwgnet_grasp.trials.pictures import Pictures
@@ -118,11 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
     options.record = options.record == "true"
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on(signal.SIGTERM)
     try:
         settings = load_settings(options.config_dir, replan=options.replan)
         options.out.mkdir(parents=True, exist_ok=True)

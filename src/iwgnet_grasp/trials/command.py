@@ -14,6 +14,7 @@ import typer
 
 from iwgnet_grasp.cluster import ClusterError
 from iwgnet_grasp.overrides import parse_overrides
+from iwgnet_grasp.progress import interrupt_on
 from iwgnet_grasp.supervisor import CellError
 from iwgnet_grasp.trials.batch import (
     BatchError,
@@ -293,11 +294,7 @@ def _existing(path: Path | None) -> str:
 
 def main() -> None:
     """Entry point: what a user can mend ends in one line."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on(signal.SIGTERM)
     try:
         status = app(prog_name="run_trials", standalone_mode=False)
         if status == 130:  # what typer makes of ctrl-C

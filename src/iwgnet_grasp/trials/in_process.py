@@ -20,6 +20,7 @@ import numpy as np
 
 from iwgnet_grasp.perception.types import CameraIntrinsics, GraspRectangle, Look, PerceptionError
 from iwgnet_grasp.priority import PriorityConfig, Ranking, rank
+from iwgnet_grasp.progress import interrupt_on
 from iwgnet_grasp.supervisor import CellError, Outcome, Target, load_settings
 from iwgnet_grasp.trials.lift import core_rectangle
 from iwgnet_grasp.trials.record import Trial, judged_by, run_trial, summary_line
@@ -276,11 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.seed < 0:
         parser.error("--seed must not be negative")
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on(signal.SIGTERM)
     pictures = None
     if options.out is not None:
         from iwgnet_grasp.trials.pictures import Pictures
