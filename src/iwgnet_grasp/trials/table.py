@@ -12,18 +12,8 @@ Rows = list[list[str]]
 
 def success_rows(summary: dict) -> tuple[list[str], Rows]:
     """Head and rows: a scene a row, the paper's figure beside ours."""
-    head = [
-        "scene",
-        "success",
-        "rate",
-        "95 % interval",
-        "paper",
-        "attempts",
-        "GSR",
-        "pushes",
-        "set aside",
-    ]
-    head += ["cleared", "picks/h", "slip mm", "slip deg", "placement mm"]
+    head = ["scene", "success", "rate", "95 % interval", "paper", "attempts", "GSR", "pushes"]
+    head += ["set aside", "cleared", "picks/h", "slip mm", "slip deg", "placement mm"]
     head += ["simulated s", "wall s", "x real"]
     rows = []
     for scene, s in summary["scenes"].items():
@@ -76,7 +66,8 @@ def cause_rows(summary: dict) -> tuple[list[str], Rows]:
 
 def comparison_rows(comparison: dict) -> tuple[list[str], Rows]:
     """Head and rows: a variant and scene a row."""
-    head = ["variant", "scene", "success", "rate", "95 % interval", "GSR", "cleared", "picks/h"]
+    head = ["variant", "scene", "success", "rate", "95 % interval", "GSR", "pushes"]
+    head += ["cleared", "picks/h"]
     rows = []
     for variant in comparison["variants"]:
         for scene, s in variant["summary"]["scenes"].items():
@@ -88,6 +79,7 @@ def comparison_rows(comparison: dict) -> tuple[list[str], Rows]:
                     percent(s["success_rate"]),
                     interval(s["interval_95"]),
                     percent(s["gsr"]),
+                    str(s.get("pushes", 0)),
                     percent(s["cleared"]),
                     number(s["picks_per_hour"]),
                 ]
