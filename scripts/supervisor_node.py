@@ -14,6 +14,7 @@ import rosgraph
 import rospy
 from iwgnet_grasp.msg import Topics
 
+from iwgnet_grasp.progress import interrupt_on
 from iwgnet_grasp.supervisor import CellError, load_settings
 from iwgnet_grasp.trials.record import run_trial, summary_line
 from iwgnet_grasp.trials.ros import RosCell
@@ -31,11 +32,7 @@ def simulator_runs() -> bool:
 
 def main() -> int:
     rospy.init_node("supervisor", disable_signals=True)
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    interrupt_on(signal.SIGTERM)
     out = rospy.get_param("~out", "")
     scene = rospy.get_param("~scene", "")
     seed = rospy.get_param("~seed", 0)

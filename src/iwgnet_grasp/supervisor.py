@@ -123,13 +123,17 @@ def load_settings(config_dir: str | Path, **changes: object) -> Settings:
 
 @dataclass
 class Attempt:
-    """One executed pick."""
+    """One pick, or what was set aside before it became one."""
 
     target: Target
     outcome: Outcome
     tray_slot: int
     start_time_s: float  # on the cell's clock
     end_time_s: float
+
+    @property
+    def executed(self) -> bool:
+        return self.outcome.reason not in NOT_EXECUTED
 
 
 @dataclass
@@ -149,7 +153,7 @@ def pick_line(number: int, attempt: Attempt) -> str:
     """The line a person reads after each pick."""
     target, outcome = attempt.target, attempt.outcome
     grasp = target.grasp
-    failed = "set aside" if outcome.reason in NOT_EXECUTED else "failed"
+    failed = "failed" if attempt.executed else "set aside"
     verdict = "picked" if outcome.success else f"{failed} ({outcome.reason})"
     note = f": {outcome.message}" if outcome.message and not outcome.success else ""
     return (
@@ -217,10 +221,9 @@ def clear_table(
             start = cell.time()
             outcome = cell.execute(target, slot % settings.tray_slots)
             attempt = Attempt(target, outcome, slot, start, cell.time())
-            executed = outcome.reason not in NOT_EXECUTED
-            (cycle.attempts if executed else cycle.set_aside).append(attempt)
-            say(pick_line(len(cycle.attempts) + (not executed), attempt))
-            if executed:
+            (cycle.attempts if attempt.executed else cycle.set_aside).append(attempt)
+            say(pick_line(len(cycle.attempts) + (not attempt.executed), attempt))
+            if attempt.executed:
                 tried.add(target.object_id)
             if outcome.success:
                 slot += 1
@@ -230,7 +233,7 @@ def clear_table(
             if len(cycle.attempts) + len(cycle.set_aside) >= settings.max_attempts:
                 cycle.ended = "attempts_used_up"
                 return cycle
-            if settings.replan == "every" and executed:
+            if settings.replan == "every" and attempt.executed:
                 break
             targets = cell.plan(scene_id, cycle.failed, taken)
             left = [t for t in targets if t.object_id not in tried]

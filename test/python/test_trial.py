@@ -29,7 +29,7 @@ class Table:
         self, tries, fatal_pick=None, error=None, qualities=(1.0,), pushes=True, no_way_to=()
     ):
         self.tries = dict(enumerate(tries))
-        self.no_way_to = list(no_way_to)  # objects, for the first grasp on each
+        self.no_way_to = list(no_way_to)  # objects, once for each grasp on them that is refused
         self.clock = 0.0
         self.looks = 0
         self.executed = []
