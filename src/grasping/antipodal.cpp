@@ -60,7 +60,8 @@ std::optional<float> cross(const Facet& facet, const Eigen::Vector3f& origin,
 
 // The part's surface as the gripper meets it.
 struct PosedPart {
-  Eigen::Matrix3Xf points, normals;  // base_link
+  Eigen::MatrixX3f points;   // base_link; a coordinate's values lie side by side
+  Eigen::Matrix3Xf normals;  // base_link
   Eigen::Vector3d com;
   float area_per_point;              // m^2
   double freedom;                    // share of a grasp's quality that what rests on it leaves
@@ -95,17 +96,20 @@ std::optional<Squeeze> squeeze(const PosedPart& part, const GraspPose& pose, dou
   touched.clear();
   index.clear();
   float low = std::numeric_limits<float>::max(), high = -low, rim_low = low, rim_high = high;
-  for (Eigen::Index i = 0; i < part.points.cols(); ++i) {
-    const Eigen::Vector3f p = part.points.col(i) - center;
-    const float h = p.dot(up);
-    if (h < -kRim || h > static_cast<float>(kPadHeight) + kRim) continue;
-    const float t = p.dot(across);
-    if (std::abs(t) > half_width + kRim) continue;
-    const float s = p.dot(along);
-    if (std::abs(s) > half_opening) continue;
+  Eigen::Matrix3f axes;
+  axes << along, across, up;
+  thread_local Eigen::MatrixX3f points;  // along, across, up from the tips
+  points = (part.points * axes).rowwise() - center.transpose() * axes;
+  const float* const coordinates = points.data();
+  const Eigen::Index count = points.rows();
+  const float top = static_cast<float>(kPadHeight);
+  for (Eigen::Index i = 0; i < count; ++i) {
+    const float s = coordinates[i], t = coordinates[count + i], h = coordinates[2 * count + i];
+    if (h < -kRim || h > top + kRim || std::abs(t) > half_width + kRim || std::abs(s) > half_opening)
+      continue;
     rim_low = std::min(rim_low, s);
     rim_high = std::max(rim_high, s);
-    if (h < 0.0f || h > static_cast<float>(kPadHeight) || std::abs(t) > half_width) continue;
+    if (h < 0.0f || h > top || std::abs(t) > half_width) continue;
     touched.push_back({s, t, h});
     index.push_back(static_cast<int>(i));
     low = std::min(low, s);
@@ -216,7 +220,7 @@ class Labeller {
     const PartGrasps& model = *part.grasps;
     PosedPart posed;
     const Eigen::Isometry3f T = part.T_base_part.cast<float>();
-    posed.points = (T.linear() * model.points).colwise() + T.translation();
+    posed.points = ((T.linear() * model.points).colwise() + T.translation()).transpose();
     posed.normals = T.linear() * model.normals;
     posed.com = part.T_base_part.translation();
     posed.area_per_point = static_cast<float>(model.area / std::max<Eigen::Index>(1, model.points.cols()));

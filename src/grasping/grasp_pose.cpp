@@ -23,9 +23,10 @@ constexpr double kSurfaceShare = 0.8;     // of the band's heights lie below wha
 constexpr double kCoreShare = 0.7;
 // Slope of the object's upper side.
 constexpr double kPatchHalf = 0.012;      // m across the closing line, of the patch that is fitted
-constexpr double kPlaneTolerance = 0.0015;  // m, 3 sigma of depth
+constexpr float kPlaneTolerance = 0.0015f;  // m, 3 sigma of depth
 constexpr double kPlaneBelow = 0.008;     // m, a plane this far under the surface is something else
 constexpr double kPlaneShare = 0.3;       // least share of the patch that must lie in the plane
+constexpr float kSliver = 1e-5f;          // m^2, area seen from above of three points that give no plane
 constexpr int kPlaneTrials = 200;
 constexpr double kGoesOn = 0.004;         // m from where a straight upper side would be
 constexpr double kBetween = 0.010;        // m beside the middle between the pads: an object between them lies nearer
@@ -36,7 +37,7 @@ constexpr double kSideShare = 0.4;        // of the overlap of finger and object
 constexpr double kAmpleShare = 0.5;       // of the pad's width that touches: more is no better
 constexpr double kTouchless = 0.2;        // of the quality that is left where nothing seems to touch: the
                                           // camera sees sides badly
-constexpr double kViewAlong = 0.09, kViewAcross = 0.05;  // m around a grasp, what the gripper's body reaches
+constexpr double kViewAlong = 0.08, kViewAcross = 0.04;  // m around a grasp, what the gripper's body reaches
 constexpr double kPitchScale = 3.0;       // a part that leans along the pads is held as flat: its
                                           // angle counts by so much less
 
@@ -100,70 +101,81 @@ double underside(const GraspPoseConfig& config, double outwards) {
 }
 
 // Gaps are tried in steps of kStep; index i is the gap i * kStep.
-double tip_height_at(int gap) {
+int steps(double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); }
+
+// finger_tip_height() of each gap.
+const std::vector<double>& tip_heights() {
   static const auto table = [] {
     std::vector<double> heights;
     for (int i = 0; i * kStep <= kinematics::max_gap() + kStep; ++i)
       heights.push_back(finger_tip_height(i * kStep));
     return heights;
   }();
-  return table[gap];
+  return table;
 }
 
 // m, how far the tips sink at most when the fingers close on from a gap.
 double sinks_from(int gap) {
-  double lowest = 0.0;
-  for (int i = 0; i < gap; ++i) lowest = std::max(lowest, tip_height_at(i) - tip_height_at(gap));
-  return lowest;
+  const auto& heights = tip_heights();
+  return *std::max_element(heights.begin(), heights.begin() + gap + 1) - heights[gap];
 }
 
 // How high the tips must stand so that both fingers clear what lies beside the grasp's centre, at
-// every gap. A finger meets the highest point over the pad's width and some play.
+// any gap. A finger meets the highest point over the pad's width and some play.
 class Clearance {
  public:
   // floor: no tip goes below it.
   Clearance(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
             int first_gap, int last_gap, double floor)
-      : first_(first_gap) {
-    const double step = heights.resolution();
+      : config_(config), step_(heights.resolution()), floor_(floor), first_gap_(first_gap),
+        lowest_(std::max(0, last_gap - first_gap + 1), kUnasked) {
     const double half = kinematics::kPadWidth / 2 + config.side_clearance;
     const double reach = config.finger_outline.empty() ? config.finger_thickness
                                                        : config.finger_outline.back().x();
-    const int across = static_cast<int>(std::ceil(half / step));
-    const int begin = static_cast<int>(std::ceil(first_gap * kStep / 2 / step));
-    const int end = static_cast<int>(std::ceil((last_gap * kStep / 2 + reach) / step));
-    std::vector<double> profile(std::max(0, end - begin + 1));
-    for (int side = 0; side < 2; ++side) {
-      for (int i = begin; i <= end; ++i) {
-        const Eigen::Vector2d p = axes.center + axes.along * ((side ? i : -i) * step);
-        double highest = floor;
+    const int across = static_cast<int>(std::ceil(half / step_));
+    first_ = static_cast<int>(std::ceil(first_gap * kStep / 2 / step_));
+    const int last = static_cast<int>(std::ceil((last_gap * kStep / 2 + reach) / step_));
+    for (int i = first_; i <= last; ++i) {
+      double highest = floor;
+      for (const int side : {-1, 1}) {
+        const Eigen::Vector2d p = axes.center + axes.along * (side * i * step_);
         for (int j = -across; j <= across; ++j) {
           const Eigen::Vector2d q = p + axes.across * (half * j / across);
           highest = std::max(highest, heights.at(q.x(), q.y()));
         }
-        profile[i - begin] = highest;
       }
-      for (int gap = first_gap; gap <= last_gap; ++gap) {
-        const double face = gap * kStep / 2;
-        double lowest_tip = floor;
-        for (int i = static_cast<int>(std::ceil(face / step - 1e-9)); i <= end; ++i) {
-          const double rise = underside(config, i * step - face);
-          if (!std::isfinite(rise)) break;
-          lowest_tip = std::max(lowest_tip, profile[i - begin] - rise);
-        }
-        tips_[side].push_back(lowest_tip + config.floor_clearance);
-      }
+      profile_.push_back(highest);
     }
   }
 
-  // Whether a finger stands free at `gap` when its tip comes to `tip` once the gap is `closed`.
-  bool free(int side, double tip, int closed, int gap) const {
-    return tips_[side][gap - first_] <= tip + tip_height_at(closed) - tip_height_at(gap) + 1e-9;
+  // Whether both fingers stand free at `gap` when their tips come to `tip` once the gap is `closed`.
+  bool free(double tip, int closed, int gap) {
+    double& lowest = lowest_[gap - first_gap_];
+    if (lowest == kUnasked) lowest = lowest_tips(gap);
+    return lowest <= tip + tip_heights_[closed] - tip_heights_[gap] + 1e-9;
   }
 
  private:
-  int first_;
-  std::array<std::vector<double>, 2> tips_;
+  static constexpr double kUnasked = -std::numeric_limits<double>::infinity();
+
+  double lowest_tips(int gap) const {
+    const double face = gap * kStep / 2;
+    double lowest = floor_;
+    const int last = first_ + static_cast<int>(profile_.size()) - 1;
+    for (int i = static_cast<int>(std::ceil(face / step_ - 1e-9)); i <= last; ++i) {
+      const double rise = underside(config_, i * step_ - face);
+      if (!std::isfinite(rise)) break;
+      lowest = std::max(lowest, profile_[i - first_] - rise);
+    }
+    return lowest + config_.floor_clearance;
+  }
+
+  const GraspPoseConfig& config_;
+  const std::vector<double>& tip_heights_ = tip_heights();
+  double step_, floor_;
+  int first_gap_, first_;
+  std::vector<double> profile_;  // m, the higher of both sides, from first_ steps beside the centre on
+  std::vector<double> lowest_;   // of each gap, once it was asked for
 };
 
 std::string millimetres(double metres) {
@@ -191,15 +203,15 @@ double alone(double contact, double width, double engaged, double rise, const Gr
 }
 
 // Position of the tips at which both fingers find room, `deepest` (m) below the surface at most: as
-// deep as there is room close to the object. `floor` is the table's height; rise as for alone().
-Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPoseConfig& config,
-                double surface, double width, double floor, double deepest, double rise) {
-  const auto steps = [](double metres) { return static_cast<int>(std::floor(metres / kStep + 1e-9)); };
+// deep as there is room close to the object. clearance: from gaps of kCoreShare of the width on.
+// `floor` is the table's height; rise as for alone().
+Descent descend(Clearance& clearance, const GraspPoseConfig& config, double surface, double width,
+                double floor, double deepest, double rise) {
   const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
   const int expected = steps(width);
-  const Clearance clearance(heights, axes, config, first, widest, floor);
+  const auto& heights = tip_heights();
   Descent best;
   double most = -1.0;
   for (double engaged = deepest; engaged >= config.min_engagement - 1e-9;
@@ -208,20 +220,19 @@ Descent descend(const HeightMap& heights, const GraspAxes& axes, const GraspPose
     const double share = std::exp(-shallow * shallow);
     if (share <= most) break;  // no place beside the object could make up for it
     const double tip = surface - engaged;
-    const auto clear = [&](int gap, int contact) {
-      return clearance.free(0, tip, contact, gap) && clearance.free(1, tip, contact, gap);
-    };
     // Contact: the nearest place to the centre where both fingers stand free.
     int contact = first;
-    while (contact <= widest && !clear(contact, contact)) ++contact;
+    while (contact <= widest && !clearance.free(tip, contact, contact)) ++contact;
     if (contact > widest) continue;
     // Beside a shoulder of the object they may still close to the expected width, and sink.
     const int closed = std::min(contact, expected);
-    const double lowest = tip - (tip_height_at(closed) - tip_height_at(contact));
+    const double lowest = tip - (heights[closed] - heights[contact]);
     // What slides out of wide open fingers lets them close, and sink.
     if (lowest - sinks_from(closed) < floor + config.floor_clearance) continue;
     int opening = contact;
-    while (opening + 1 <= std::min(widest, contact + margin) && clear(opening + 1, contact)) ++opening;
+    while (opening + 1 <= std::min(widest, contact + margin) &&
+           clearance.free(tip, contact, opening + 1))
+      ++opening;
     if (opening < contact + play) continue;
     const double worth = share * alone(contact * kStep, width, engaged, rise, config);
     if (worth > most) {
@@ -345,8 +356,10 @@ void lower(GraspPose& pose, const Pose& T_base_view, const HeightMap& heights,
     return most;
   };
   const double rise = (T_base_view.linear() * Eigen::Vector3d(axes.along.x(), axes.along.y(), 0.0)).z();
+  Clearance clearance(heights, axes, config, steps(kCoreShare * pose.width),
+                      steps(config.max_opening), floor);
   const auto down_to = [&](double deepest) {
-    return descend(heights, axes, config, surface, pose.width, floor, deepest, rise);
+    return descend(clearance, config, surface, pose.width, floor, deepest, rise);
   };
   Descent descent = down_to(config.insertion_depth);
   if (!descent.found) return infeasible("fingers find no room beside the object");
@@ -443,33 +456,37 @@ Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
   const double step = heights.resolution();
   const int n = std::max(2, static_cast<int>(width / 2 / step));
   const int m = static_cast<int>(kPatchHalf / step);
-  std::vector<Eigen::Vector3d> points;  // along, across, over the surface
-  for (int i = -n; i <= n; ++i)
-    for (int j = -m; j <= m; ++j) {
+  // Points: m along, across, over the surface.
+  const int count = (2 * n + 1) * (2 * m + 1);
+  Eigen::ArrayXf xs(count), ys(count), zs(count);
+  for (int i = -n, k = 0; i <= n; ++i)
+    for (int j = -m; j <= m; ++j, ++k) {
       const Eigen::Vector2d p = center + along * (i * step) + across * (j * step);
-      points.emplace_back(i * step, j * step, heights.at(p.x(), p.y()) - surface);
+      xs[k] = i * step;
+      ys[k] = j * step;
+      zs[k] = heights.at(p.x(), p.y()) - surface;
     }
-  const auto count = static_cast<std::uint32_t>(points.size());
   std::uint32_t state = 1;
   const auto draw = [&] {  // Numerical Recipes' linear congruential generator
     state = state * 1664525u + 1013904223u;
-    return points[(static_cast<std::uint64_t>(state) * count) >> 32];
+    const auto i = (static_cast<std::uint64_t>(state) * count) >> 32;
+    return Eigen::Vector3f(xs[i], ys[i], zs[i]);
   };
-  Eigen::Vector3d best = Eigen::Vector3d::Zero();  // slopes and height at the grasp
+  Eigen::Vector3f best = Eigen::Vector3f::Zero();  // slopes and height at the grasp
   int most = 0;
-  const auto lies_in = [](const Eigen::Vector3d& plane, const Eigen::Vector3d& p) {
-    return std::abs(plane.x() * p.x() + plane.y() * p.y() + plane.z() - p.z()) < kPlaneTolerance;
+  const auto lies_in = [&](const Eigen::Vector3f& plane, int i) {
+    return std::abs(plane.x() * xs[i] + plane.y() * ys[i] + plane.z() - zs[i]) < kPlaneTolerance;
   };
   for (int trial = 0; trial < kPlaneTrials; ++trial) {
-    const Eigen::Vector3d a = draw(), b = draw(), c = draw();
-    const Eigen::Vector3d normal = (b - a).cross(c - a);
-    if (std::abs(normal.z()) < 1e-5) continue;  // m^2: a sliver
-    Eigen::Vector3d plane(-normal.x() / normal.z(), -normal.y() / normal.z(), 0.0);
+    const Eigen::Vector3f a = draw(), b = draw(), c = draw();
+    const Eigen::Vector3f normal = (b - a).cross(c - a);
+    if (std::abs(normal.z()) < kSliver) continue;
+    Eigen::Vector3f plane(-normal.x() / normal.z(), -normal.y() / normal.z(), 0.0f);
     plane.z() = a.z() - plane.x() * a.x() - plane.y() * a.y();
     if (std::abs(plane.x()) > max_along || std::abs(plane.y()) > max_across || plane.z() < -kPlaneBelow)
       continue;
-    const int inliers = static_cast<int>(std::count_if(
-        points.begin(), points.end(), [&](const Eigen::Vector3d& p) { return lies_in(plane, p); }));
+    const auto inliers = static_cast<int>(
+        ((plane.x() * xs + plane.y() * ys + plane.z() - zs).abs() < kPlaneTolerance).count());
     if (inliers > most) {
       most = inliers;
       best = plane;
@@ -479,13 +496,13 @@ Slope surface_slope(const HeightMap& heights, const Eigen::Vector2d& center,
   for (int pass = 0; pass < 2; ++pass) {
     Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
     Eigen::Vector3d right = Eigen::Vector3d::Zero();
-    for (const Eigen::Vector3d& p : points) {
-      if (!lies_in(best, p)) continue;
-      const Eigen::Vector3d row(p.x(), p.y(), 1.0);
+    for (int i = 0; i < count; ++i) {
+      if (!lies_in(best, i)) continue;
+      const Eigen::Vector3d row(xs[i], ys[i], 1.0);
       normal += row * row.transpose();
-      right += row * p.z();
+      right += row * zs[i];
     }
-    best = normal.ldlt().solve(right);
+    best = normal.ldlt().solve(right).cast<float>();
   }
   if (!best.allFinite() || std::abs(best.x()) > max_along || std::abs(best.y()) > max_across) return {};
   return {best.x(), best.y()};

@@ -37,9 +37,11 @@ cv::Rect pixels_of(const Eigen::Vector2d& low, const Eigen::Vector2d& high,
 // Fills unknown cells ring by ring with the lowest or the highest of their known neighbours.
 void fill_unknown(cv::Mat& grid, bool lowest) {
   std::vector<cv::Point> open;
-  for (int r = 0; r < grid.rows; ++r)
+  for (int r = 0; r < grid.rows; ++r) {
+    const float* row = grid.ptr<float>(r);
     for (int c = 0; c < grid.cols; ++c)
-      if (grid.at<float>(r, c) == kUnknown) open.emplace_back(c, r);
+      if (row[c] == kUnknown) open.emplace_back(c, r);
+  }
   if (open.size() == grid.total()) {
     grid.setTo(0.0f);
     return;
@@ -116,22 +118,38 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& h
   HeightMap view;
   view.resolution_ = resolution_;
   view.outside_ = -std::numeric_limits<double>::infinity();
-  view.origin_ = -half.array() + resolution_ / 2;
-  const int columns = static_cast<int>(std::ceil(2 * half.x() / resolution_));
-  const int rows = static_cast<int>(std::ceil(2 * half.y() / resolution_));
+  // The origin is a cell's middle: what is asked for in whole cells from there lies on no border.
+  const int right = static_cast<int>(std::ceil(half.x() / resolution_));
+  const int up = static_cast<int>(std::ceil(half.y() / resolution_));
+  view.origin_ = -resolution_ * Eigen::Vector2d(right, up);
+  const int columns = 2 * right + 1, rows = 2 * up + 1, cells = rows * columns;
   view.grid_.create(rows, columns, CV_32FC1);
-  view.grid_.setTo(kUnknown);
+  // One more, for what lies outside.
+  thread_local std::vector<float> highest_buffer;
+  highest_buffer.assign(cells + 1, kUnknown);
+  float* const highest = highest_buffer.data();
   const Pose T_view_base = T_base_view.inverse();
   // In cells of the view and, upwards, metres.
   const float scale = 1.0 / resolution_, step = resolution_;
   const Eigen::Vector3f units(scale, scale, 1.0f);
   const Eigen::Matrix3f R = units.asDiagonal() * T_view_base.linear().cast<float>();
-  const Eigen::Vector3f along_column = R.col(0) * step, upwards = R.col(2);
+  const Eigen::Vector3f along_column = R.col(0) * step, along_row = R.col(1) * step, upwards = R.col(2);
+  const Eigen::Vector3f corner =
+      units.cwiseProduct((T_view_base * Eigen::Vector3d(origin_.x(), origin_.y(), 0.0)).cast<float>()) +
+      Eigen::Vector3f(right + 0.5f, up + 0.5f, 0.0f);
   const int last_column = grid_.cols - 1;
+  thread_local std::vector<int> cell_buffer;
+  thread_local std::vector<float> height_buffer;
+  cell_buffer.resize(grid_.cols);
+  height_buffer.resize(grid_.cols);
+  int* const cell_of_top = cell_buffer.data();
+  float* const height = height_buffer.data();
+  // m down a wall from column to column and from row to row of the view
+  const float per_column = 1.0f / std::max(std::abs(upwards.x()), 1e-6f);
+  const float per_row = 1.0f / std::max(std::abs(upwards.y()), 1e-6f);
+  const int i_step = upwards.x() > 0.0f ? -1 : 1, j_step = upwards.y() > 0.0f ? -1 : 1;
   for (int r = 0; r < grid_.rows; ++r) {
-    const Eigen::Vector3d start(origin_.x(), origin_.y() + r * resolution_, 0.0);
-    const Eigen::Vector3f ground = units.cwiseProduct((T_view_base * start).cast<float>()) +
-                                   Eigen::Vector3f(half.x() * scale, half.y() * scale, 0.0f);
+    const Eigen::Vector3f ground = corner + along_row * static_cast<float>(r);
     // The columns from which something between the table and `highest_` comes to lie in the view.
     float first = 0.0f, last = last_column;
     for (const int axis : {0, 1}) {
@@ -146,18 +164,47 @@ HeightMap HeightMap::seen_from(const Pose& T_base_view, const Eigen::Vector2d& h
       first = std::max(first, std::min(low / slope, high / slope));
       last = std::min(last, std::max(low / slope, high / slope));
     }
+    const int begin = static_cast<int>(std::ceil(first)), end = static_cast<int>(last) + 1;
     const float *row = grid_.ptr<float>(r), *around = around_.ptr<float>(r);
-    for (int c = static_cast<int>(std::ceil(first)); c <= static_cast<int>(last); ++c) {
-      const Eigen::Vector3f at = ground + along_column * static_cast<float>(c);
-      // Down to the lowest neighbour: the wall of a step is seen from the side.
-      for (float z = row[c]; z >= around[c]; z -= step) {
-        const Eigen::Vector3f p = at + upwards * z;
-        if (!(p.x() >= 0.0f && p.y() >= 0.0f && p.x() < columns && p.y() < rows)) continue;
-        float& height = view.grid_.ptr<float>(static_cast<int>(p.y()))[static_cast<int>(p.x())];
-        height = std::max(height, p.z());
+    const auto cell_at = [&](float x, float y) {
+      const bool inside = (x >= 0.0f) & (y >= 0.0f) & (x < columns) & (y < rows);
+      const int cell = static_cast<int>(y) * columns + static_cast<int>(x);
+      return inside ? cell : cells;
+    };
+    for (int c = begin; c < end; ++c) {  // without memory in common: four columns at a time
+      const float column = c, z = row[c];
+      cell_of_top[c] = cell_at(ground.x() + along_column.x() * column + upwards.x() * z,
+                               ground.y() + along_column.y() * column + upwards.y() * z);
+      height[c] = ground.z() + along_column.z() * column + upwards.z() * z;
+    }
+    for (int c = begin; c < end; ++c) {
+      const float top = height[c];
+      highest[cell_of_top[c]] = std::max(highest[cell_of_top[c]], top);
+      // Down to the lowest neighbour: the wall of a step is seen from the side. Through the cells of
+      // the view as by Amanatides and Woo (1987).
+      const float wall = row[c] - around[c];
+      if (wall < step) continue;
+      const float x = ground.x() + along_column.x() * c + upwards.x() * row[c];
+      const float y = ground.y() + along_column.y() * c + upwards.y() * row[c];
+      int i = cvFloor(x), j = cvFloor(y);
+      // m of the way down to the next column and to the next row
+      float to_column = (upwards.x() > 0.0f ? x - i : i + 1 - x) * per_column;
+      float to_row = (upwards.y() > 0.0f ? y - j : j + 1 - y) * per_row;
+      for (float down; (down = std::min(to_column, to_row)) <= wall;) {
+        if (to_column < to_row) {
+          i += i_step;
+          to_column += per_column;
+        } else {
+          j += j_step;
+          to_row += per_row;
+        }
+        if (i < 0 || j < 0 || i >= columns || j >= rows) continue;
+        float& there = highest[j * columns + i];
+        there = std::max(there, top - upwards.z() * down);
       }
     }
   }
+  std::copy_n(highest, cells, view.grid_.ptr<float>());
   fill_unknown(view.grid_, false);
   cv::minMaxLoc(view.grid_, nullptr, &view.highest_);
   return view;
