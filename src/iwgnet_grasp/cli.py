@@ -80,6 +80,15 @@ def train(
             help="Least share of crops of parts that are hard to grasp; 0: as they come.",
         ),
     ] = 0.5,
+    quality_power: Annotated[
+        float,
+        typer.Option(
+            min=0.1,
+            max=1,
+            help="Of the labels' quality in what Q learns; 1: the mean quality of a place, lower: "
+            "more whether there is a grasp at all.",
+        ),
+    ] = 0.5,
     seed: Annotated[int, typer.Option(help="Of weights, order, augmentation and split.")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = False,
     accelerator: Annotated[str, typer.Option(help="auto, cpu or gpu.")] = "auto",
@@ -108,6 +117,7 @@ def train(
         split=split.value,
         patience=patience,
         hard_share=hard_share,
+        quality_power=quality_power,
         seed=seed,
     )
     typer.echo(f"seed {seed}, network {network}, data {', '.join(map(str, data))}")

@@ -65,12 +65,14 @@ def test_background_has_no_angle_and_no_width():
     assert grasp_loss(logits, labels).angle > before.angle
 
 
-def test_loss_is_smallest_at_the_labels():
+@pytest.mark.parametrize("power", [1.0, 0.5])
+def test_loss_is_smallest_at_the_labels(power):
     labels, _ = labels_and_logits()
-    right = torch.cat([torch.logit(labels[:, :1].clamp(1e-6, 1 - 1e-6)), labels[:, 1:4]], dim=1)
-    loss = grasp_loss(right, labels)
+    target = labels[:, :1] ** power
+    right = torch.cat([torch.logit(target.clamp(1e-6, 1 - 1e-6)), labels[:, 1:4]], dim=1)
+    loss = grasp_loss(right, labels, power)
     assert loss.total < 1e-4
-    assert grasp_loss(right + 0.2, labels).total > loss.total
+    assert grasp_loss(right + 0.2, labels, power).total > loss.total
 
 
 def bar_set(root, count, seed=0):

@@ -38,6 +38,16 @@ def test_weights_and_card_are_read_back(weights):
     ]
 
 
+def test_quality_is_that_of_the_labels_whatever_power_of_it_was_learnt(weights):
+    heights = torch.rand(1, 1, 96, 96)
+    with torch.inference_mode():
+        learnt = load_weights(weights)[0](heights)
+        change_card(weights, training={"quality_power": 0.5})
+        maps = load_weights(weights)[0](heights)
+    torch.testing.assert_close(maps.q, learnt.q**2)
+    assert torch.equal(maps.width, learnt.width)
+
+
 def fails(path, *words):
     with pytest.raises(WeightsError) as caught:
         load_weights(path)

@@ -33,6 +33,7 @@ class GraspNetwork(nn.Module):
     """
 
     stride = 8
+    quality_power = 1.0  # of the quality that the logit was trained for (training.losses)
 
     def raw(self, x: Tensor) -> Tensor:
         """[N, 4, H, W]: quality logit, cos 2theta, sin 2theta, opening / reference."""
@@ -48,7 +49,10 @@ class GraspNetwork(nn.Module):
 
     def forward(self, x: Tensor) -> GraspMaps:
         q, cos, sin, width = self.logits(x).unbind(1)
-        return GraspMaps(torch.sigmoid(q), cos, sin, width)
+        quality = torch.sigmoid(q)
+        if self.quality_power != 1:
+            quality = quality ** (1 / self.quality_power)
+        return GraspMaps(quality, cos, sin, width)
 
 
 def count_parameters(network: nn.Module) -> int:

@@ -99,7 +99,13 @@ def load_weights(name_or_path: str | Path) -> tuple[GraspNetwork, dict[str, Any]
             f"reads {WIDTH_REFERENCE_PX:g} px; train again"
         )
     load_state(network, path, str(card["network"]))
+    network.quality_power = quality_power(card)
     return network.eval(), card
+
+
+def quality_power(card: dict[str, Any]) -> float:
+    """The setting of a grasp network's training; 1 in cards from before there was one."""
+    return float(card.get("training", {}).get("quality_power", 1.0))
 
 
 def _line(error: Exception) -> str:

@@ -15,6 +15,7 @@ from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.depth import HEIGHT_CLIP, HEIGHT_UNIT
 from iwgnet_grasp.data.grasp_dataset import VIEW_PX
 from iwgnet_grasp.networks.grasp_network import WIDTH_REFERENCE_PX
+from iwgnet_grasp.networks.weights import quality_power
 
 log = logging.getLogger(__name__)
 
@@ -94,6 +95,8 @@ def earlier_stage(first: dict[str, Any], card: dict[str, Any]) -> dict[str, Any]
         differing = {k: v for k, v in theirs.items() if ours.get(k) != v}
         if differing:
             stage[key] = differing
+    if quality_power(first) != quality_power(card):
+        stage.setdefault("training", {})["quality_power"] = quality_power(first)
     if first.get("before"):
         stage["before"] = first["before"]
     return stage

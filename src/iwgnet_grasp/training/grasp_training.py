@@ -56,6 +56,7 @@ class GraspTrainingSettings:
     # Least share of an epoch whose best grasp has a quality below HARD_QUALITY: buried parts
     # are a quarter of the crops and nine tenths of the wrong predictions.
     hard_share: float = 0.5
+    quality_power: float = 0.5  # of the labels' quality in the target (losses.grasp_loss)
     validation: float = 0.1  # share held out of the data when there is no validation folder
     split: str = "object"
     patience: int = 0  # epochs without a better top-1 until training stops; 0: never
@@ -86,6 +87,7 @@ class GraspTraining(lightning.LightningModule):
         self.validation_set = GraspDataset(validation, settings.input_px)
         self.workers = workers
         network = create_network(settings.network)
+        network.quality_power = settings.quality_power
         self.network = network.to(memory_format=torch.channels_last)
 
     def train_dataloader(self) -> DataLoader:
@@ -137,7 +139,9 @@ class GraspTraining(lightning.LightningModule):
     def _loss(self, batch: tuple[torch.Tensor, torch.Tensor]):
         heights, labels = batch
         return grasp_loss(
-            self.network.logits(heights.to(memory_format=torch.channels_last)), labels
+            self.network.logits(heights.to(memory_format=torch.channels_last)),
+            labels,
+            self.settings.quality_power,
         )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

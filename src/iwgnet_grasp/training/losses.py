@@ -14,18 +14,26 @@ class GraspLoss(NamedTuple):
 
 
 def grasp_loss(
-    logits: Tensor, labels: Tensor, angle_weight: float = 1.0, width_weight: float = 2.0
+    logits: Tensor,
+    labels: Tensor,
+    quality_power: float = 1.0,
+    angle_weight: float = 1.0,
+    width_weight: float = 2.0,
 ) -> GraspLoss:
     """Cross entropy on Q, smooth L1 on cos, sin and width where a grasp is.
 
     logits: [N, 4, H, W] of GraspNetwork.logits. labels: [N, 5, H, W] (q, cos, sin, width, mask).
-    Q: cross entropy with the soft target (its minimum is the target itself, and a grasp of quality
-    0.1 still pulls ten times as hard as one of 0.01), summed over all pixels and divided by the
-    number of grasp pixels, so that it does not depend on how much empty table is seen. The
-    entropy of the target is taken off: a perfect Q costs 0. The background has neither angle nor
-    width.
+    Q: cross entropy with the soft target q ** quality_power (its minimum is the target itself, and
+    a grasp of quality 0.1 still pulls ten times as hard as one of 0.01), summed over all pixels and
+    divided by the number of grasp pixels, so that it does not depend on how much empty table is
+    seen. The entropy of the target is taken off: a perfect Q costs 0. The background has neither
+    angle nor width.
+
+    A Q learnt with power 1 is the quality on average: a place that would be good and is barred four
+    times in five is worth as much as one that is poor and sure. The lower the power, the more
+    counts whether there is a grasp at all.
     """
-    target, mask = labels[:, 0], labels[:, 4:5]
+    target, mask = labels[:, 0] ** quality_power, labels[:, 4:5]
     positives = mask.sum().clamp(min=1)
     logit = logits[:, 0].float()
     cross_entropy = F.binary_cross_entropy_with_logits(logit, target, reduction="sum")
