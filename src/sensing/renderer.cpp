@@ -8,10 +8,12 @@
 #include <cstring>
 #include <limits>
 #include <map>
+#include <utility>
 
 #include "changed_tiles.h"
 #include "iwgnet_grasp/sensing/pinhole.h"
 #include "parallel.h"
+#include "rasteriser.h"
 #include "shading.h"
 
 namespace iwgnet_grasp::sensing {
@@ -19,6 +21,7 @@ namespace {
 
 constexpr int kTile = 4;  // pixels; 4 x 4 coherent rays make a packet
 constexpr int kLanes = kTile * kTile;
+constexpr int kBand = 256;  // rows of a depth image that one thread draws at a time
 constexpr float kFar = std::numeric_limits<float>::infinity();
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr float kOcclusionRange = 0.08f;  // m, of ambient occlusion: the size of the parts
@@ -30,6 +33,7 @@ constexpr float kFilterDepth = 0.004f;    // m, shadows are not smoothed across 
 
 struct Mesh {
   RTCScene scene = nullptr;
+  TriangleMesh triangles;
   std::vector<std::array<Vec3, 3>> normals;  // of each triangle's corners, mesh frame
   Eigen::AlignedBox3d box;                   // mesh frame
   cv::Mat print;                             // of a sheet, CV_8UC1; else empty
@@ -40,7 +44,8 @@ struct Instance {
   int mesh;
   RTCGeometry geometry;
   Material material;
-  Rotation R;  // instance -> base
+  Pose T_base_instance;
+  Rotation R;  // the same in single precision
   Vec3 t;
   bool visible = true;
 };
@@ -58,7 +63,7 @@ bool same(const PinholeIntrinsics& a, const PinholeIntrinsics& b) {
          a.cx == b.cx && a.cy == b.cy;
 }
 
-// What an image was made of, so that the next one is made anew only where it may differ.
+// What a colour image was made of, so that the next is made anew only where it may differ.
 struct Drawn {
   struct Object {
     int mesh;
@@ -69,7 +74,6 @@ struct Drawn {
   PinholeIntrinsics camera{};
   Pose T_base_camera = Pose::Identity();
   Light light;
-  Eigen::AlignedBox3d region;
   std::vector<Object> objects;
   bool whole = false;  // there is such an image
 
@@ -222,12 +226,6 @@ struct Renderer::Impl {
   struct { cv::Mat visibility, direct, ambient, depth, ids, linear; } frame;  // of color()
   Drawn drawn_color;
   float lowest_seen = 0.0f;  // m, z of the lowest surface in the last colour image
-  struct DepthImage {
-    Drawn drawn;
-    cv::Mat depth;
-  };
-  std::array<DepthImage, 2> depth_images;  // of an imager and of the camera that it is aligned to
-  std::size_t oldest_depth = 0;
 
   Impl() : device(rtcNewDevice(nullptr)) {
     if (!device) throw Error("renderer: Embree cannot start on this machine");
@@ -258,6 +256,7 @@ struct Renderer::Impl {
   }
 
   void place(Instance& instance, const Pose& T) {
+    instance.T_base_instance = T;
     const Eigen::Matrix3f R = T.rotation().cast<float>();
     const Eigen::Vector3f t = T.translation().cast<float>();
     const float columns[12] = {R(0, 0), R(1, 0), R(2, 0), R(0, 1), R(1, 1), R(2, 1),
@@ -279,19 +278,17 @@ struct Renderer::Impl {
     return corners;
   }
 
-  // The tiles in which an image may differ from the one that was drawn; it becomes what is drawn.
-  // light: of a colour image, in which objects also shade others.
-  ChangedTiles changes(Drawn& drawn, const PinholeIntrinsics& camera, const Pose& T_base_camera,
-                       const Light* light) const {
+  // The tiles in which a colour image may differ from the one that was drawn, for objects also shade
+  // others; it becomes what is drawn.
+  ChangedTiles changes(const PinholeIntrinsics& camera, const Pose& T_base_camera,
+                       const Light& light) {
+    Drawn& drawn = drawn_color;
     ChangedTiles tiles(camera, T_base_camera, kTile);
-    bool whole = !drawn.of(camera, T_base_camera) || (light && !same(*light, drawn.light)) ||
-                 (!light && (region.min() != drawn.region.min() ||
-                             region.max() != drawn.region.max())) ||
+    bool whole = !drawn.of(camera, T_base_camera) || !same(light, drawn.light) ||
                  drawn.objects.size() != instances.size();
     drawn.objects.resize(instances.size());
     const auto mark = [&](const Points& corners) {
-      if (!light) return tiles.mark(corners);
-      const Points reached = shaded(corners, light->position.cast<double>(), light->radius,
+      const Points reached = shaded(corners, light.position.cast<double>(), light.radius,
                                     kOcclusionRange, lowest_seen);
       if (reached.empty()) whole = true;
       tiles.mark(reached);
@@ -315,8 +312,7 @@ struct Renderer::Impl {
     if (whole) tiles.mark_all();
     drawn.camera = camera;
     drawn.T_base_camera = T_base_camera;
-    if (light) drawn.light = *light;
-    drawn.region = region;
+    drawn.light = light;
     drawn.whole = true;
     return tiles;
   }
@@ -326,7 +322,7 @@ struct Renderer::Impl {
     dirty = false;
   }
 
-  // The pixels that may see the region; it begins at a tile, so that rays are the same to the bit.
+  // The pixels that may see the region.
   cv::Rect seen_region(const PinholeIntrinsics& camera, const Pose& T_base_camera) const {
     const cv::Rect image(0, 0, camera.width, camera.height);
     if (region.isEmpty()) return image;
@@ -337,34 +333,30 @@ struct Renderer::Impl {
       if (!(p.z() > 0)) return image;  // beside or behind the camera: no rectangle bounds it
       seen.extend(project(camera, p));
     }
-    const cv::Point first(cvFloor(seen.min().x() / kTile) * kTile,
-                          cvFloor(seen.min().y() / kTile) * kTile);
+    const cv::Point first(cvFloor(seen.min().x()), cvFloor(seen.min().y()));
     const cv::Point last(cvCeil(seen.max().x()) + 1, cvCeil(seen.max().y()) + 1);
     return cv::Rect(first, last) & image;
   }
 
-  // Calls write(u, v, lane, packet) for every pixel of the region, or of its changed tiles, after its
-  // packet was traced.
-  template <typename Write>
-  void trace(const PinholeIntrinsics& camera, const Pose& T_base_camera, Write&& write,
-             const ChangedTiles* changed = nullptr) {
-    commit();
-    const RayFrame frame(camera, T_base_camera);
+  // Depth and instances.
+  std::pair<cv::Mat, cv::Mat> rasterised(const PinholeIntrinsics& camera,
+                                         const Pose& T_base_camera) const {
+    require_camera(camera);
     const cv::Rect seen = seen_region(camera, T_base_camera);
-    parallel_rows(seen.height, kTile, [&](int row, int) {
-      const int first = seen.y + row;
-      RTCIntersectContext context;
-      rtcInitIntersectContext(&context);
-      context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-      Packet packet(frame);
-      for (int u = seen.x; u < seen.br().x; u += kTile) {
-        if (changed && !changed->at(first / kTile, u / kTile)) continue;
-        packet.aim(frame, camera, u, first);
-        rtcIntersect16(packet.valid, scene, &context, &packet.hit);
-        for (int i = 0; i < kLanes; ++i)
-          if (packet.valid[i]) write(u + i % kTile, first + i / kTile, i, packet);
+    cv::Mat depth(camera.height, camera.width, CV_32FC1, kNaN);
+    cv::Mat ids(camera.height, camera.width, CV_32SC1, -1);
+    parallel_rows(seen.height, kBand, [&](int first, int last) {
+      const cv::Rect band(seen.x, seen.y + first, seen.width, last - first);
+      Rasteriser rasteriser(camera, T_base_camera, band, depth, ids);
+      for (std::size_t i = 0; i < instances.size(); ++i) {
+        if (!instances[i].visible) continue;
+        const Mesh& mesh = meshes[instances[i].mesh];
+        rasteriser.draw(mesh.triangles, mesh.box, instances[i].T_base_instance,
+                        static_cast<int>(i));
       }
+      rasteriser.finish();
     });
+    return {depth, ids};
   }
 
   Surface surface(const Packet& packet, int lane) const {
@@ -440,6 +432,7 @@ int Renderer::add_mesh(const TriangleMesh& mesh) {
   rtcAttachGeometry(built.scene, geometry);
   rtcReleaseGeometry(geometry);
   rtcCommitScene(built.scene);
+  built.triangles = mesh;
   built.normals = corner_normals(mesh);
   for (const auto& vertex : mesh.vertices) built.box.extend(vertex.cast<double>());
   impl_->meshes.push_back(std::move(built));
@@ -495,7 +488,6 @@ void Renderer::set_visible(int instance, bool visible) {
 void Renderer::clear_instances() {
   impl_->drop_instances();
   impl_->drawn_color.whole = false;  // a scene's images do not depend on the scene before
-  for (auto& image : impl_->depth_images) image.drawn.whole = false;
   rtcReleaseScene(impl_->scene);
   impl_->new_scene();
 }
@@ -504,38 +496,13 @@ void Renderer::set_region(const Eigen::AlignedBox3d& box) { impl_->region = box;
 
 cv::Mat Renderer::depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                         cv::Mat* instances) {
-  require_camera(camera);
-  auto& images = impl_->depth_images;
-  std::size_t k = 0;
-  while (k < images.size() && !images[k].drawn.of(camera, T_base_camera)) ++k;
-  if (k == images.size()) k = impl_->oldest_depth;
-  impl_->oldest_depth = (k + 1) % images.size();
-  auto& [drawn, depth] = images[k];
-  if (instances) {
-    *instances = cv::Mat(camera.height, camera.width, CV_32SC1, -1);
-    drawn.whole = false;  // they are wanted of all pixels
-  }
-  const ChangedTiles changed = impl_->changes(drawn, camera, T_base_camera, nullptr);
-  if (changed.all()) depth = cv::Mat(camera.height, camera.width, CV_32FC1, kNaN);
-  impl_->trace(
-      camera, T_base_camera,
-      [&](int u, int v, int lane, const Packet& packet) {
-        const bool nothing = packet.hit.hit.geomID[lane] == RTC_INVALID_GEOMETRY_ID;
-        depth.ptr<float>(v)[u] = nothing ? kNaN : packet.hit.ray.tfar[lane];
-        if (instances)
-          instances->ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);
-      },
-      &changed);
-  return depth.clone();
+  const auto [depth, ids] = impl_->rasterised(camera, T_base_camera);
+  if (instances) *instances = ids;
+  return depth;
 }
 
 cv::Mat Renderer::instances(const PinholeIntrinsics& camera, const Pose& T_base_camera) {
-  require_camera(camera);
-  cv::Mat ids(camera.height, camera.width, CV_32SC1, -1);
-  impl_->trace(camera, T_base_camera, [&](int u, int v, int lane, const Packet& packet) {
-    ids.ptr<int>(v)[u] = static_cast<int>(packet.hit.hit.instID[0][lane]);  // invalid is -1
-  });
-  return ids;
+  return impl_->rasterised(camera, T_base_camera).second;
 }
 
 cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_camera,
@@ -554,7 +521,7 @@ cv::Mat Renderer::color(const PinholeIntrinsics& camera, const Pose& T_base_came
   depth.create(height, width, CV_32FC1);
   ids.create(height, width, CV_32SC1);
 
-  const ChangedTiles changed = impl_->changes(impl_->drawn_color, camera, T_base_camera, &light);
+  const ChangedTiles changed = impl_->changes(camera, T_base_camera, light);
   impl_->commit();
   const RayFrame frame(camera, T_base_camera);
   std::vector<float> lowest((height + kTile - 1) / kTile, impl_->lowest_seen);  // of each tile row

@@ -105,7 +105,7 @@ cv::Mat stereo_depth(const cv::Mat& ideal_left, const cv::Mat& ideal_right,
   const std::uint64_t stream = mix(seed);
 
   cv::Mat measured(height, width, CV_32FC1, kNaN);
-  // Beside it nothing is measured: the renderer may have traced a part of the image only.
+  // Beside it nothing is measured: the renderer may have drawn a part of the image only.
   const int off = cvCeil(lateral * normal.back());
   cv::Rect seen = known(ideal_left);
   seen = cv::Rect(seen.tl() - cv::Point(off, off), seen.br() + cv::Point(off, off)) &

@@ -1,9 +1,10 @@
-// Ray-traced images against analytic geometry and photometry.
+// Rendered images against analytic geometry and photometry.
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <cstring>
 #include <functional>
+#include <random>
 #include <utility>
 #include <vector>
 
@@ -67,6 +68,136 @@ TEST(Depth, SphereMatchesTheQuadratic) {
   EXPECT_GT(hits, 5000);
 }
 
+// The table goes on beside and behind the camera, which looks down at it at 25 deg, rolled by 10 deg.
+TEST(Depth, TableUnderATiltedCameraIsExact) {
+  const PinholeIntrinsics camera{640, 600, 400, 400, 319.5, 250};  // several bands of rows
+  Renderer renderer;
+  renderer.add_instance(renderer.add_box({3, 3, 0.1}), {}, at(0, 0, -0.05));
+  const double height = 0.6;
+  Pose T_base_camera = at(0, 0, height);
+  T_base_camera.linear() << 0, 0, 1, -1, 0, 0, 0, -1, 0;  // looks along x
+  T_base_camera.rotate(Eigen::AngleAxisd(-25 * M_PI / 180, Eigen::Vector3d::UnitX()));
+  T_base_camera.rotate(Eigen::AngleAxisd(10 * M_PI / 180, Eigen::Vector3d::UnitZ()));
+  const cv::Mat depth = renderer.depth(camera, T_base_camera);
+  int hits = 0, misses = 0;
+  for (int v = 0; v < depth.rows; ++v)
+    for (int u = 0; u < depth.cols; ++u) {
+      const Eigen::Vector3d d = T_base_camera.linear() * deproject(camera, u, v, 1.0);
+      const double z = -height / d.z();
+      const double beside = (z * d).head<2>().cwiseAbs().maxCoeff() - 1.5;  // m, of the table
+      if (z > 0 && beside < -1e-6) {
+        ++hits;
+        ASSERT_NEAR(depth.at<float>(v, u), z, 1e-6) << u << ", " << v;
+      } else if (z < 0 || beside > 0.1) {
+        ++misses;
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u))) << u << ", " << v;
+      }
+    }
+  EXPECT_GT(hits, 80000);
+  EXPECT_GT(misses, 40000);
+}
+
+// Triangles of any winding around the camera, many of them partly behind it. For a ray d, the solution
+// of (a b c) x = d is positive where it meets the triangle, and the sum of x is the inverse depth.
+TEST(Depth, IsOfTheNearestTriangleOnARaySeenFromEitherSide) {
+  std::mt19937 random(5);
+  std::uniform_real_distribution<float> metre(-1, 1);
+  Pose T_base_camera = at(0.1, -0.2, 0.3);
+  T_base_camera.rotate(Eigen::AngleAxisd(1.0, Eigen::Vector3d(1, -2, 0.5).normalized()));
+  Renderer renderer;
+  std::vector<Eigen::Matrix3d> inverses;
+  int fronts = 0, crossing = 0;
+  for (int i = 0; i < 40; ++i) {
+    TriangleMesh mesh{{}, {{0, 1, 2}}};
+    for (int k = 0; k < 3; ++k) mesh.vertices.emplace_back(metre(random), metre(random), metre(random));
+    Pose T = at(metre(random), metre(random), metre(random));
+    T.rotate(Eigen::AngleAxisd(3 * metre(random), Eigen::Vector3d::UnitY()));
+    renderer.add_instance(renderer.add_mesh(mesh), {}, T);
+    Eigen::Matrix3d corners;
+    for (int k = 0; k < 3; ++k)
+      corners.col(k) = T_base_camera.inverse() * T * mesh.vertices[k].cast<double>();
+    inverses.push_back(corners.inverse());
+    fronts += corners.determinant() < 0;
+    crossing += corners.row(2).minCoeff() < 0 && corners.row(2).maxCoeff() > 0;
+  }
+  EXPECT_GT(fronts, 10);
+  EXPECT_LT(fronts, 30);
+  EXPECT_GT(crossing, 10);
+  cv::Mat ids;
+  const cv::Mat depth = renderer.depth(kCamera, T_base_camera, &ids);
+  EXPECT_EQ(cv::countNonZero(renderer.instances(kCamera, T_base_camera) != ids), 0);
+  int checked = 0;
+  for (int v = 0; v < depth.rows; ++v)
+    for (int u = 0; u < depth.cols; ++u) {
+      double nearest = 0, second = 0;
+      int seen = -1;
+      bool on_an_edge = false;
+      for (std::size_t i = 0; i < inverses.size(); ++i) {
+        const Eigen::Vector3d x = inverses[i] * deproject(kCamera, u, v, 1.0);
+        const double margin = 1e-6 * x.cwiseAbs().maxCoeff();
+        on_an_edge |= std::abs(x.minCoeff()) < margin;
+        if (x.minCoeff() <= 0) continue;
+        second = std::max(second, std::min(x.sum(), nearest));
+        if (x.sum() > nearest) {
+          nearest = x.sum();
+          seen = static_cast<int>(i);
+        }
+      }
+      if (on_an_edge || (second > 0 && 1 / second - 1 / nearest < 1e-5)) continue;
+      ++checked;
+      ASSERT_EQ(ids.at<int>(v, u), seen) << u << ", " << v;
+      if (seen < 0)
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u))) << u << ", " << v;
+      else
+        ASSERT_NEAR(depth.at<float>(v, u), 1 / nearest, 1e-6) << u << ", " << v;
+    }
+  EXPECT_GT(checked, 0.99 * depth.total());
+}
+
+// Tiles of all shapes down to slivers of 1/30 px, many with a corner or a side right on a pixel.
+TEST(Depth, APlaneOfManyTrianglesHasNoHoles) {
+  const Eigen::Vector3d normal = Eigen::Vector3d(0.3, -0.5, 1).normalized();
+  const auto depth_at = [&](double u, double v) {  // of the plane normal * p = 0.6
+    return 0.6 / normal.dot(deproject(kCamera, u, v, 1.0));
+  };
+  Pose turned = at(0.4, -0.3, 0.9);
+  turned.rotate(Eigen::AngleAxisd(2.0, Eigen::Vector3d(3, 1, -2).normalized()));
+  for (const Pose& T_base_camera : {Pose::Identity(), turned})
+    for (const auto& [across, down] :
+         {std::pair(1.0, 1.0), {0.5, 2.5}, {1.0 / 30, 37.0}, {53.0, 1.0 / 30}, {300.0, 250.0}}) {
+      const int columns = cvCeil(kCamera.width / across), rows = cvCeil(kCamera.height / down);
+      TriangleMesh mesh;
+      for (int j = 0; j <= rows; ++j)
+        for (int i = 0; i <= columns; ++i) {
+          const double u = -1 + i * across * 1.01, v = -1 + j * down * 1.01;
+          mesh.vertices.push_back(
+              (T_base_camera * deproject(kCamera, u, v, depth_at(u, v))).cast<float>());
+          if (i == columns || j == rows) continue;
+          const std::uint32_t a = j * (columns + 1) + i, b = a + columns + 1;
+          mesh.triangles.push_back({a, a + 1, b});
+          mesh.triangles.push_back({b, a + 1, b + 1});
+        }
+      Renderer renderer;
+      renderer.add_instance(renderer.add_mesh(mesh), {}, Pose::Identity());
+      const cv::Mat depth = renderer.depth(kCamera, T_base_camera);
+      for (int v = 0; v < depth.rows; ++v)
+        for (int u = 0; u < depth.cols; ++u)
+          ASSERT_NEAR(depth.at<float>(v, u), depth_at(u, v), 2e-6)
+              << u << ", " << v << "; tiles of " << across << " x " << down << " px";
+    }
+}
+
+TEST(Depth, AFaceSeenEdgeOnLeavesNoTrace) {
+  PinholeIntrinsics camera = kCamera;
+  camera.cx = 160;  // the rays of this column lie in the box's left face
+  Renderer renderer;
+  renderer.add_instance(renderer.add_box({0.25, 0.25, 0.25}), {}, at(0.125, 0, 1.125));
+  const cv::Mat depth = renderer.depth(camera, Pose::Identity());
+  for (int u : {160, 161, 184})
+    for (int v = 96; v <= 144; ++v) ASSERT_NEAR(depth.at<float>(v, u), 1.0, 1e-6) << u << ", " << v;
+  EXPECT_TRUE(std::isnan(depth.at<float>(120, 159)));
+}
+
 TEST(Depth, FollowsCameraAndInstancePoses) {
   Renderer renderer;
   const int box = renderer.add_instance(renderer.add_box({0.2, 0.2, 0.2}), {}, at(0.5, 0.1, 0.1));
@@ -100,8 +231,8 @@ TEST(Instances, NameWhatEachPixelShows) {
   EXPECT_EQ(renderer.instances(kCamera, Pose::Identity()).at<int>(120, 160), 0);
 }
 
-// What lies in the region looks the same to the bit, whatever tile it begins in; the rest is empty.
-TEST(Region, LimitsWhatIsTraced) {
+// What lies in the region looks the same to the bit; the rest is empty.
+TEST(Region, LimitsWhatIsDrawn) {
   Renderer renderer;
   renderer.add_instance(renderer.add_mesh(sphere(0.3, 40)), {}, at(0.1, 0.05, 1.0));
   renderer.add_instance(renderer.add_box({4, 4, 0.2}), {}, at(0, 0, 1.4));
@@ -118,8 +249,8 @@ TEST(Region, LimitsWhatIsTraced) {
         ++inside;
         ASSERT_EQ(depth.at<float>(v, u), z) << u << ", " << v;
         ASSERT_EQ(ids.at<int>(v, u), whole_ids.at<int>(v, u));
-      } else if (u < kCamera.cx - 0.11 / 0.6 * kCamera.fx - 4 ||  // a tile
-                 v > kCamera.cy + 0.17 / 0.6 * kCamera.fy + 4) {
+      } else if (u < kCamera.cx - 0.11 / 0.6 * kCamera.fx - 1 ||
+                 v > kCamera.cy + 0.17 / 0.6 * kCamera.fy + 2) {
         ++outside;
         ASSERT_TRUE(std::isnan(depth.at<float>(v, u))) << u << ", " << v;
         ASSERT_EQ(ids.at<int>(v, u), -1);
@@ -321,14 +452,17 @@ TEST(Renderer, ImagesOfASceneDoNotDependOnTheSceneBefore) {
   const auto image = [](Renderer& renderer, double x) {
     renderer.clear_instances();
     renderer.add_instance(0, {}, at(x, 0, 0.5) * Eigen::AngleAxisd(0.5, Eigen::Vector3d::UnitY()));
-    return renderer.depth(kCamera, Pose::Identity());
+    return std::pair(renderer.depth(kCamera, Pose::Identity()),
+                     renderer.color(kCamera, Pose::Identity(), {}, 0, 0));
   };
   Renderer first, second;
   for (Renderer* renderer : {&first, &second}) renderer->add_box({0.1, 0.1, 0.1});
   const double hair = 5e-5;  // m, less than what makes an object of the same scene be drawn anew
   image(first, 0.0);
-  const cv::Mat a = image(first, hair), b = image(second, hair);
-  EXPECT_EQ(std::memcmp(a.data, b.data, a.total() * 4), 0);
+  const auto [depth, color] = image(first, hair);
+  const auto [expected_depth, expected_color] = image(second, hair);
+  EXPECT_EQ(std::memcmp(depth.data, expected_depth.data, depth.total() * 4), 0);
+  EXPECT_EQ(std::memcmp(color.data, expected_color.data, color.total() * 3), 0);
 }
 
 TEST(Renderer, BadInputIsRefused) {

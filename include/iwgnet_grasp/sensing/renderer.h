@@ -1,4 +1,5 @@
-// Ray-traced images of the cell (Embree): colour with light, shadow and materials; ideal depth.
+// Images of the cell: ray-traced colour with light, shadow and materials (Embree); ideal depth and
+// instances by a z-buffer.
 #pragma once
 
 #include <cstdint>
@@ -26,8 +27,8 @@ struct Light {
   float radius = 0.10f;                         // m, of the lamp; 0 gives hard shadows
 };
 
-// An image after another of the same camera and light is traced anew only where an object that has
-// changed, or has moved by more than 0.1 mm, is or was seen, or shades or shaded what is seen.
+// A colour image after another of the same camera and light is traced anew only where an object that
+// has changed, or has moved by more than 0.1 mm, is or was seen, or shades or shaded what is seen.
 class Renderer {
  public:
   Renderer();
@@ -44,15 +45,15 @@ class Renderer {
   void set_material(int instance, const Material& material);
   void set_visible(int instance, bool visible);
   void clear_instances();  // keeps the meshes
-  // From now on depth() and instances() trace only the pixels of the upright rectangle around the
-  // image of this box (m, base_link); elsewhere nothing is hit. An empty box: all pixels.
+  // From now on depth() and instances() draw only the pixels of the upright rectangle around the
+  // image of this box (m, base_link); elsewhere nothing is seen. An empty box: all pixels.
   void set_region(const Eigen::AlignedBox3d& box);
 
-  // CV_32FC1, m along the optical axis, NaN where no surface is hit. T_base_camera: optical -> base.
-  // instances, where given, becomes what instances() returns for the same rays.
+  // CV_32FC1, m along the optical axis, NaN where no surface is seen. T_base_camera: optical -> base.
+  // instances, where given, becomes what instances() returns.
   cv::Mat depth(const PinholeIntrinsics& camera, const Pose& T_base_camera,
                 cv::Mat* instances = nullptr);
-  // CV_32SC1: instance handle hit by each pixel, -1 for none.
+  // CV_32SC1: handle of the instance that each pixel sees, -1 for none.
   cv::Mat instances(const PinholeIntrinsics& camera, const Pose& T_base_camera);
   // CV_8UC3 RGB; noise_sigma: sensor noise in 8-bit steps, drawn from `seed`.
   cv::Mat color(const PinholeIntrinsics& camera, const Pose& T_base_camera, const Light& light,
