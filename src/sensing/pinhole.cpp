@@ -17,6 +17,18 @@ void require_size(const cv::Mat& image, const PinholeIntrinsics& k) {
               "; pass the image together with its own camera info");
 }
 
+// Within bounds that an int holds, and without a jump, so that loops over pixels are vectorised.
+int ceil_within(float low, float high, float x) {
+  const float inside = std::min(high, std::max(low, x));
+  const int truncated = static_cast<int>(inside);
+  return truncated + (truncated < inside);
+}
+int floor_within(float low, float high, float x) {
+  const float inside = std::min(high, std::max(low, x));
+  const int truncated = static_cast<int>(inside);
+  return truncated - (truncated > inside);
+}
+
 }  // namespace
 
 Eigen::Vector3d deproject(const PinholeIntrinsics& k, double u, double v, double z) {
@@ -35,36 +47,43 @@ cv::Mat align_depth(const cv::Mat& depth, const PinholeIntrinsics& from,
   // filled, or a camera with the finer grid would see holes.
   const Eigen::Matrix3f R = T_to_from.rotation().cast<float>();
   const Eigen::Vector3f t = T_to_from.translation().cast<float>();
-  const float fx = to.fx, fy = to.fy, cx = to.cx, cy = to.cy;
+  const float fx = to.fx, fy = to.fy, cx = to.cx, cy = to.cy, width = to.width, height = to.height;
   const Eigen::Vector3f across = R.col(0) / from.fx, diagonal = across + R.col(1) / from.fy;
   constexpr float kFar = std::numeric_limits<float>::infinity();
-  cv::Mat aligned(to.height, to.width, CV_32FC1, cv::Scalar(kFar));
+  constexpr int kRun = 64;  // px, whose corners are computed in one vectorised loop
+  cv::Mat aligned(to.height, to.width, CV_32FC1, cv::Scalar(kNaN));
   for (int v = 0; v < depth.rows; ++v) {
-    const float* row = depth.ptr<float>(v);
     const Eigen::Vector3f first = R * deproject(from, -0.5, v - 0.5, 1.0).cast<float>();
-    for (int u = 0; u < depth.cols; ++u) {
-      const float z = row[u];
-      if (!(z > 0.0f) || z == kFar) continue;
-      const Eigen::Vector3f a = (first + across * static_cast<float>(u)) * z + t;
-      const Eigen::Vector3f b = a + diagonal * z;
-      if (a.z() <= 0.0f || b.z() <= 0.0f) continue;
-      const float a_inverse = 1.0f / a.z(), b_inverse = 1.0f / b.z();
-      const float ax = fx * a.x() * a_inverse + cx, bx = fx * b.x() * b_inverse + cx;
-      const float ay = fy * a.y() * a_inverse + cy, by = fy * b.y() * b_inverse + cy;
-      const int left = std::max(0, cvCeil(std::min(ax, bx)));
-      const int right = std::min(to.width - 1, cvFloor(std::max(ax, bx)));
-      const int top = std::max(0, cvCeil(std::min(ay, by)));
-      const int bottom = std::min(to.height - 1, cvFloor(std::max(ay, by)));
-      const float seen = 0.5f * (a.z() + b.z());
-      for (int y = top; y <= bottom; ++y) {
-        float* out = aligned.ptr<float>(y);
-        for (int x = left; x <= right; ++x) out[x] = std::min(out[x], seen);
+    for (int start = 0; start < depth.cols; start += kRun) {
+      const float* z = depth.ptr<float>(v) + start;
+      const int count = std::min(kRun, depth.cols - start);
+      float nearest[kRun], seen[kRun];
+      int left[kRun], right[kRun], top[kRun], bottom[kRun];
+      for (int i = 0; i < count; ++i) {
+        const float u = static_cast<float>(start + i);
+        const float ax = (first.x() + across.x() * u) * z[i] + t.x(), bx = ax + diagonal.x() * z[i];
+        const float ay = (first.y() + across.y() * u) * z[i] + t.y(), by = ay + diagonal.y() * z[i];
+        const float az = (first.z() + across.z() * u) * z[i] + t.z(), bz = az + diagonal.z() * z[i];
+        const float a_inverse = 1.0f / az, b_inverse = 1.0f / bz;
+        const float au = fx * ax * a_inverse + cx, bu = fx * bx * b_inverse + cx;
+        const float av = fy * ay * a_inverse + cy, bv = fy * by * b_inverse + cy;
+        left[i] = ceil_within(0.0f, width, std::min(au, bu));
+        right[i] = floor_within(-1.0f, width - 1.0f, std::max(au, bu));
+        top[i] = ceil_within(0.0f, height, std::min(av, bv));
+        bottom[i] = floor_within(-1.0f, height - 1.0f, std::max(av, bv));
+        nearest[i] = std::min(az, bz);
+        seen[i] = 0.5f * (az + bz);
+      }
+      for (int i = 0; i < count; ++i) {
+        if (!(z[i] > 0.0f && z[i] < kFar && nearest[i] > 0.0f)) continue;
+        for (int y = top[i]; y <= bottom[i]; ++y) {
+          float* out = aligned.ptr<float>(y);
+          for (int x = left[i]; x <= right[i]; ++x)
+            if (!(out[x] <= seen[i])) out[x] = seen[i];
+        }
       }
     }
   }
-  for (int y = 0; y < to.height; ++y)
-    for (float *p = aligned.ptr<float>(y), *end = p + to.width; p != end; ++p)
-      if (*p == kFar) *p = kNaN;
   return aligned;
 }
 
