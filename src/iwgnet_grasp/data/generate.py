@@ -22,7 +22,6 @@ import json
 import shutil
 import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +37,14 @@ from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.grasp_rectangle import COLUMNS, JAW, OPENING, QUALITY, THETA, X, Y
 from iwgnet_grasp.data.jacquard import format_grasps
 from iwgnet_grasp.data.lift_check import as_text, plan_check, require_stored, summary
-from iwgnet_grasp.data.scene_pool import ProcessPool, RayPool, SceneKind, library_digest, open_pool
+from iwgnet_grasp.data.scene_pool import (
+    ProcessPool,
+    RayPool,
+    SceneKind,
+    library_digest,
+    open_pool,
+    results,
+)
 from iwgnet_grasp.files import disk_error, sole_writer, write_whole
 from iwgnet_grasp.overrides import OverrideError, changed_config, parse_overrides
 from iwgnet_grasp.parts.library import PartError, add_to_library, part_from_mesh
@@ -611,16 +617,9 @@ def _in_piles(
     piles: dict[int, list[int]] = {}
     for number in numbers:
         piles.setdefault(number // LOOKS, []).append(number)
-    left = iter(piles.items())
-    running: set[Future] = set()
-    while True:
-        while len(running) < 2 * pool.size and (item := next(left, None)):
-            running.add(pool.submit(method, seed, *item, *arguments))
-        if not running:
-            return
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            yield pool.result(future)
+    calls = ((pile, (method, seed, pile, wanted, *arguments)) for pile, wanted in piles.items())
+    for _, result in results(pool, calls):
+        yield result
 
 
 def generate(

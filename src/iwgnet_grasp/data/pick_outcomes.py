@@ -17,7 +17,6 @@ import math
 import signal
 import zipfile
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -284,19 +283,14 @@ def describe_picks(folder: Path) -> dict:
 
 
 def _fill(out: Path, missing: list[int], seed: int, pool: Any, quiet: bool) -> None:
-    left, running = iter(missing), {}
+    from iwgnet_grasp.data.scene_pool import results
+
     try:
         with progress_bar(quiet) as bar:
             task = bar.add_task(f"piles in {out}", total=len(missing))
-            while True:
-                while len(running) < 2 * pool.size and (pile := next(left, None)) is not None:
-                    running[pool.submit("picks", seed, pile)] = pile
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    pile = running.pop(future)
-                    write_whole(out / f"{pile:06d}.npz", pool.result(future))
-                    bar.advance(task)
+            for pile, content in results(pool, ((i, ("picks", seed, i)) for i in missing)):
+                write_whole(out / f"{pile:06d}.npz", content)
+                bar.advance(task)
     finally:
         pool.close()
 

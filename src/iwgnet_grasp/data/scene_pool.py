@@ -11,7 +11,8 @@ import hashlib
 import multiprocessing
 import os
 import signal
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Hashable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,3 +203,19 @@ def open_pool(
     if address:
         return RayPool(address, workers, kind, package_dir)
     return ProcessPool(workers or os.cpu_count() or 1, kind, package_dir)
+
+
+def results(
+    pool: ProcessPool | RayPool, calls: Iterable[tuple[Hashable, tuple]]
+) -> Iterator[tuple[Hashable, Any]]:
+    """(key, result) of each (key, arguments of submit()), as they are done; two calls a worker are
+    under way, so that none waits."""
+    left, running = iter(calls), {}
+    while True:
+        while len(running) < 2 * pool.size and (call := next(left, None)) is not None:
+            key, arguments = call
+            running[pool.submit(*arguments)] = key
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), pool.result(future)
