@@ -88,7 +88,7 @@ def train(
             help="Of the labels' quality in what Q learns; 1: the mean quality of a place, lower: "
             "more whether there is a grasp at all.",
         ),
-    ] = 0.5,
+    ] = 1.0,
     seed: Annotated[int, typer.Option(help="Of weights, order, augmentation and split.")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on from the last checkpoint.")] = False,
     accelerator: Annotated[str, typer.Option(help="auto, cpu or gpu.")] = "auto",

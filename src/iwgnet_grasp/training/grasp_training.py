@@ -56,7 +56,7 @@ class GraspTrainingSettings:
     # Least share of an epoch whose best grasp has a quality below HARD_QUALITY: buried parts
     # are a quarter of the crops and nine tenths of the wrong predictions.
     hard_share: float = 0.5
-    quality_power: float = 0.5  # of the labels' quality in the target (losses.grasp_loss)
+    quality_power: float = 1.0  # of the labels' quality in the target (losses.grasp_loss)
     validation: float = 0.1  # share held out of the data when there is no validation folder
     split: str = "object"
     patience: int = 0  # epochs without a better top-1 until training stops; 0: never

@@ -74,11 +74,17 @@ class InProcessWorker(_Configured):
     def __init__(self, conditions: Conditions) -> None:
         super().__init__(conditions)
         from iwgnet_grasp.perception import load_perception
+        from iwgnet_grasp.perception.types import PerceptionError
         from iwgnet_grasp.trials.in_process import InProcessCell, load_calibration
 
-        perception = load_perception(self._config_dir / "perception.yaml")
         calibrated = load_calibration(conditions.calibration) if conditions.calibration else None
-        self.cell = InProcessCell(perception, config_dir=self._config_dir, T_base_color=calibrated)
+        folder = self._config_dir
+        try:
+            perception = load_perception(folder / "perception.yaml")
+            self.cell = InProcessCell(perception, config_dir=folder, T_base_color=calibrated)
+        except (CellError, PerceptionError) as error:
+            # By the name of the user's file, not of the copy in which --set has changed it.
+            raise CellError(str(error).replace(f"{folder}/", "config/")) from None
         if conditions.camera_offset >= 0:
             self.cell.simulated.offset_camera(conditions.camera_offset)
 
