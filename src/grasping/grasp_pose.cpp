@@ -148,6 +148,9 @@ class Clearance {
     }
   }
 
+  int first_gap() const { return first_gap_; }
+  int last_gap() const { return first_gap_ + static_cast<int>(lowest_.size()) - 1; }
+
   // Whether both fingers stand free at `gap` when their tips come to `tip` once the gap is `closed`.
   bool free(double tip, int closed, int gap) {
     double& lowest = lowest_[gap - first_gap_];
@@ -203,11 +206,11 @@ double alone(double contact, double width, double engaged, double rise, const Gr
 }
 
 // Position of the tips at which both fingers find room, `deepest` (m) below the surface at most: as
-// deep as there is room close to the object. clearance: from gaps of kCoreShare of the width on.
-// `floor` is the table's height; rise as for alone().
+// deep as there is room close to the object, at one of the clearance's gaps. `floor` is the table's
+// height; rise as for alone().
 Descent descend(Clearance& clearance, const GraspPoseConfig& config, double surface, double width,
                 double floor, double deepest, double rise) {
-  const int first = steps(kCoreShare * width), widest = steps(config.max_opening);
+  const int first = clearance.first_gap(), widest = clearance.last_gap();
   const int margin = steps(config.opening_margin);
   const int play = static_cast<int>(std::ceil(2 * config.side_clearance / kStep - 1e-9));
   const int expected = steps(width);

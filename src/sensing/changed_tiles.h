@@ -20,7 +20,6 @@ class ChangedTiles {
   // The tiles that may see the points' convex hull, and their neighbours.
   void mark(const Points& points);
   void mark_all() { all_ = true; }
-  bool all() const { return all_; }
   bool at(int tile_row, int tile_column) const {
     return all_ || tiles_.ptr<std::uint8_t>(tile_row)[tile_column];
   }
