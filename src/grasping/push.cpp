@@ -34,14 +34,14 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
   };
   // Against one object in one direction, the tips `tip` over the table.
   const auto try_push = [&](const Eigen::Vector2d& center, const Eigen::Vector2d& along, double tip) {
-    const double closing = std::atan2(along.y(), along.x()) + M_PI / 2;
+    const double closing = std::atan2(along.y(), along.x());
     const auto free = [&](const Eigen::Vector2d& p, const Eigen::Vector2d& half, double above_tips) {
       return heights.max_in(p, closing, half) + config.clearance <= tip + above_tips;
     };
     const auto has_room = [&](const Eigen::Vector2d& p) {
       return free(p, kTips, 0.0) && free(p, kFingers, kFingersAbove) && free(p, kBody, kBodyAbove);
     };
-    double back = kTips.y();
+    double back = kTips.x();
     while (back <= config.run_up && !has_room(center - back * along)) back += kStep;
     if (back > config.run_up) return false;
     const Eigen::Vector2d from = center - back * along;

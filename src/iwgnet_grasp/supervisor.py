@@ -197,9 +197,13 @@ def clear_table(
         if targets and best < settings.push_below and may_push:
             pushes += 1
             outcome = cell.push(scene_id)
-            if outcome.success:
+            if outcome.reason not in NOT_EXECUTED:  # one that broke off has moved the parts as well
                 cycle.pushes += 1
-                say(f"push {cycle.pushes}: no grasp of look {scene_id} is better than Q {best:.2f}")
+                broke_off = "" if outcome.success else f"; it broke off: {outcome.message}"
+                say(
+                    f"push {cycle.pushes}: no grasp of look {scene_id} is better than "
+                    f"Q {best:.2f}{broke_off}"
+                )
                 continue
         if not graspable:
             # Noise differs from look to look: an object may be seen, or be graspable, in the next.

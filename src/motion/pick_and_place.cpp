@@ -464,10 +464,10 @@ Trajectory PickAndPlace::retreat_from(const JointVector& q, const PickPlan& plan
 bool PickAndPlace::plan_push(const JointVector& start, const grasping::Push& push,
                              Trajectory& approach, Trajectory& sweep, std::string& why) {
   const Eigen::Vector2d way = push.to - push.from;
-  Pose T = Pose::Identity();  // closes across the way: so the fingers do not give
+  Pose T = Pose::Identity();  // closes along the way: so nothing comes between the pads
   T.linear().col(2) = -Eigen::Vector3d::UnitZ();
-  T.linear().col(1) << way.normalized(), 0.0;
-  T.linear().col(0) = T.linear().col(1).cross(T.linear().col(2));
+  T.linear().col(0) << way.normalized(), 0.0;
+  T.linear().col(1) = T.linear().col(2).cross(T.linear().col(0));
   T.translation() << push.from, push.tip_height + kinematics::kPadHeight / 2;
   world_.set_attached(std::nullopt);
   world_.set_gripper_gap(config_.push.gap);

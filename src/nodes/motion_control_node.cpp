@@ -303,9 +303,11 @@ class MotionControl {
       std::vector<Eigen::Vector3d> objects;
       for (const GraspPose& grasp : poses->grasps)
         if (std::isfinite(grasp.centroid.x)) objects.push_back(from_message(grasp.centroid));
+      result.moved = true;  // of an Error thrown below
       robot_.begin([this] { return push_server_.isPreemptRequested() || !ros::ok(); });
       const motion::PickResult pushed = pick_and_place_.push(robot_, objects);
       result.success = pushed.reason == motion::PickReason::kSucceeded;
+      result.moved = result.success || pushed.reason == motion::PickReason::kExecutionFailed;
       result.message = pushed.message;
     } catch (const Error& error) {
       result.message = error.what();

@@ -26,7 +26,7 @@ class Table:
     Their grasps have a quality of 1, after each push that of the next of `qualities`."""
 
     def __init__(
-        self, tries, fatal_pick=None, error=None, qualities=(1.0,), pushes=True, no_way_to=()
+        self, tries, fatal_pick=None, error=None, qualities=(1.0,), no_push="", no_way_to=()
     ):
         self.tries = dict(enumerate(tries))
         self.no_way_to = list(no_way_to)  # objects, once for each grasp on them that is refused
@@ -36,7 +36,7 @@ class Table:
         self.failed_seen, self.taken_seen = [], []
         self.fatal_pick, self.error = fatal_pick, error
         self.picks = []  # the judge's
-        self.qualities, self.pushes_succeed, self.pushed = list(qualities), pushes, []
+        self.qualities, self.no_push, self.pushed = list(qualities), no_push, []
 
     def look(self):
         self.looks += 1
@@ -87,9 +87,9 @@ class Table:
     def push(self, scene_id):
         self.pushed.append(scene_id)
         self.clock += PUSH_SECONDS
-        if self.pushes_succeed and len(self.qualities) > 1:
+        if self.no_push != "unreachable" and len(self.qualities) > 1:
             self.qualities.pop(0)
-        return Outcome(self.pushes_succeed, "" if self.pushes_succeed else "not_pushed")
+        return Outcome(not self.no_push, self.no_push)
 
     def time(self):
         return self.clock
@@ -155,9 +155,17 @@ def test_pushes_in_a_row_are_bounded_and_one_that_cannot_be_done_ends_nothing():
     table = Table([1, 1], qualities=[0.02])
     cycle = clear_table(table, settings, quiet)
     assert cycle.ended == "cleared" and cycle.pushes == 4  # two before each of two picks
-    stuck = Table([1], qualities=[0.02], pushes=False)
+    stuck = Table([1], qualities=[0.02], no_push="unreachable")
     cycle = clear_table(stuck, settings, quiet)
     assert cycle.ended == "cleared" and cycle.pushes == 0 and len(stuck.executed) == 1
+
+
+def test_after_a_push_that_broke_off_it_looks_again():
+    settings = load_settings(CONFIG, replan="every", push_below=0.1, max_pushes=2)
+    table = Table([1], qualities=[0.02, 0.9], no_push="execution_failed")
+    cycle = clear_table(table, settings, quiet)
+    assert cycle.ended == "cleared" and cycle.pushes == 1 and table.pushed == [1]
+    assert cycle.attempts[0].target.scene_id == 2
 
 
 def test_one_look_has_no_pushes():

@@ -38,7 +38,7 @@ def decode_grasps(
     cos = cv2.GaussianBlur(cos, (0, 0), MAP_SIGMA)
     sin = cv2.GaussianBlur(sin, (0, 0), MAP_SIGMA)
     width = cv2.GaussianBlur(width, (0, 0), MAP_SIGMA)
-    q = expected_quality(q, cos, sin, PLACE_SIGMA)
+    q = expected_quality(q, cos, sin, PLACE_SIGMA, threshold)
     grasps = []
     peaks = local_maxima(q, min_distance_px, threshold, max_grasps)
     places = peaks + places_between(q, peaks, threshold, max_grasps - len(peaks))
@@ -50,18 +50,28 @@ def decode_grasps(
     return grasps
 
 
-def expected_quality(q: np.ndarray, cos: np.ndarray, sin: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian mean of the quality along the jaws, across each pixel's closing direction."""
-    theta = 0.5 * np.arctan2(sin, cos)
-    dx, dy = np.sin(theta), np.cos(theta)  # the closing direction is (cos, -sin) in the image
-    rows, columns = np.mgrid[0 : q.shape[0], 0 : q.shape[1]].astype(np.float32)
+def expected_quality(
+    q: np.ndarray, cos: np.ndarray, sin: np.ndarray, sigma: float, least: float = 0.0
+) -> np.ndarray:
+    """Gaussian mean of the quality along the jaws, across each pixel's closing direction; 0 where no
+    q is above `least` within its reach, for the mean is not either."""
+    mean = np.zeros_like(q)
     reach = int(np.ceil(2 * sigma))
+    good = q > least
+    rows, columns = np.flatnonzero(good.any(axis=1)), np.flatnonzero(good.any(axis=0))
+    if not rows.size:
+        return mean
+    top, left = max(rows[0] - reach - 1, 0), max(columns[0] - reach - 1, 0)
+    window = np.s_[top : rows[-1] + reach + 2, left : columns[-1] + reach + 2]
+    theta = 0.5 * np.arctan2(sin[window], cos[window])
+    dx, dy = np.sin(theta), np.cos(theta)  # the closing direction is (cos, -sin) in the image
+    y, x = np.mgrid[0 : theta.shape[0], 0 : theta.shape[1]].astype(np.float32)
+    x, y = x + np.float32(left), y + np.float32(top)
     steps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (steps / sigma) ** 2)
-    mean = np.zeros_like(q)
     for step, weight in zip(steps, weights / weights.sum(), strict=True):
-        x, y = columns + np.float32(step) * dx, rows + np.float32(step) * dy
-        mean += np.float32(weight) * cv2.remap(q, x, y, cv2.INTER_LINEAR)
+        at = x + np.float32(step) * dx, y + np.float32(step) * dy
+        mean[window] += np.float32(weight) * cv2.remap(q, *at, cv2.INTER_LINEAR)
     return mean
 
 

@@ -269,7 +269,8 @@ class RosCell:
 
     def push(self, scene_id: int) -> Outcome:
         result = self._move(self._push, Topics.PUSH, PushGoal(scene_id=scene_id))
-        return Outcome(result.success, "" if result.success else "not_pushed", result.message)
+        failed = "execution_failed" if result.moved else "unreachable"
+        return Outcome(result.success, "" if result.success else failed, result.message)
 
     def _move(self, client: Any, name: str, goal: Any) -> Any:
         """The result of a motion, the arm being back at its observing pose."""
