@@ -55,9 +55,10 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
       return (p - center).norm() > kNeighbour ||
              outside(p + (way - met + kStep) * along) <= outside(p + (way - met) * along);
     };
+    // The body's front, for the rest of it comes where that has been.
     const auto goes_on = [&] {
       return std::all_of(objects.begin(), objects.end(), stays) &&
-             free(from + (way + kStep) * along, kBody, kBodyAbove);
+             free(from + (way + kBody.x()) * along, {kStep, kBody.y()}, kBodyAbove);
     };
     while (way - met < config.distance && goes_on()) way += kStep;
     if (way - met < config.min_distance) return false;

@@ -62,13 +62,16 @@ Points shaded(const Points& corners, const Eigen::Vector3d& lamp, double radius,
   Eigen::AlignedBox3d around;
   for (const Eigen::Vector3d& corner : corners) around.extend(corner);
   if (around.max().z() > lamp.z() - radius - kBelowLamp) return {};
-  Points points = corners_of({around.min().array() - range, around.max().array() + range});
+  const Points reach = corners_of({Eigen::Vector3d::Constant(-range), Eigen::Vector3d::Constant(range)});
+  Points points;
+  for (const Eigen::Vector3d& corner : corners)
+    for (const Eigen::Vector3d& by : reach) points.push_back(corner + by);
   const Eigen::AlignedBox3d lamps(Eigen::Vector3d(lamp.array() - radius),
                                   Eigen::Vector3d(lamp.array() + radius));
   for (const Eigen::Vector3d& from : corners_of(lamps))
     for (const Eigen::Vector3d& corner : corners) {
-      const double reach = (from.z() - lowest) / (from.z() - corner.z());
-      points.push_back(from + (corner - from) * std::max(reach, 1.0));
+      const double way = (from.z() - lowest) / (from.z() - corner.z());
+      points.push_back(from + (corner - from) * std::max(way, 1.0));
     }
   return points;
 }

@@ -27,7 +27,7 @@ constexpr float kOcclusionRange = 0.08f;  // m, of ambient occlusion: the size o
 constexpr float kSurfaceOffset = 2e-5f;   // m, keeps secondary rays off their own surface
 constexpr float kCrease = 0.77f;          // cos 40 deg: sharper edges are not shaded smooth
 constexpr int kPrintSamples = 6;          // a side of a pixel: the print's edges are smooth in the image
-constexpr double kStill = 1e-4;            // m, an object that moves less is drawn where it was
+constexpr double kStill = 3e-4;  // m, a third of a pixel: an object that moves less is drawn where it was
 constexpr float kFilterDepth = 0.004f;    // m, shadows are not smoothed across larger steps
 
 struct Mesh {

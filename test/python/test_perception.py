@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,12 +34,14 @@ from iwgnet_grasp.perception.merged_depth import (
     object_mask,
     own_share,
     pixel_owners,
+    standing,
     taken_away,
 )
 from iwgnet_grasp.perception.pipeline import DEFAULT_CONFIG, select
 from iwgnet_grasp.perception.types import Window
 from iwgnet_grasp.training.detector import save_detector
 
+PACKAGE = Path(__file__).resolve().parents[2]
 TABLE = 0.6  # m
 TOP = 0.58  # m, of the object
 BOX = Box(300, 200, 60, 40)
@@ -262,6 +265,18 @@ def test_candidates_lie_in_the_box_and_are_limited():
     assert [g.quality for g in kept] == pytest.approx([0.8, 0.7, 0.6])
 
 
+def test_what_stands_there_is_higher_or_unmeasured_and_no_speck():
+    heights, empty = np.zeros((80, 100), np.float32), np.ones((80, 100), np.float32)
+    part = Box(10, 10, 80, 60)
+    assert standing(heights, empty, part, 0.004) is None
+    heights[20:30, 40:60] = 0.02
+    heights[50:60, 30:36] = np.nan  # measured in the empty scene only
+    heights[0:9, 0:100] = 0.5  # outside of the part
+    heights[65, 80] = 0.1  # a speck
+    empty[40:69, 11:20] = heights[40:69, 11:20] = np.nan  # never measured
+    assert standing(heights, empty, part, 0.004) == Box(30, 20, 30, 40)
+
+
 # The whole look -----------------------------------------------------------------------------------
 
 
@@ -273,7 +288,7 @@ class KnownBoxes:
     def __init__(self, *boxes: Box) -> None:
         self.boxes = boxes
 
-    def detect(self, color: np.ndarray) -> list[Detection]:
+    def detect(self, color: np.ndarray, where: Box | None = None) -> list[Detection]:
         return [Detection("connecting_rod", 0.9, box) for box in self.boxes]
 
 
@@ -452,7 +467,7 @@ def test_backends_see_the_same(weights):
     for backend in ("torch", "openvino"):
         detector = Detector(weights, backend=backend, score_threshold=0.0)
         pixels = image[:96, :160].transpose(2, 0, 1)[None]
-        maps[backend] = detector._run(pixels)
+        maps[backend] = detector._runners[96, 160](pixels)
     for ours, theirs in zip(maps["torch"], maps["openvino"], strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0.05, atol=0.05)
 
@@ -486,6 +501,28 @@ def test_only_the_region_is_looked_at(weights):
     # The cut image has no room for boxes in the grey beside the region.
     inside = [d for d in found if overlaps(d.box, Box(80, 25, 160, 200))]
     assert [d.score for d in inside] == pytest.approx([d.score for d in cut])
+
+
+def test_a_window_around_what_stands_there_shows_the_same_objects():
+    core = pytest.importorskip("iwgnet_grasp._core")
+    cell = core.SimulatedCell(str(PACKAGE))
+    cell.load_scene("ten_stacked", 4)
+    color = cell.color()
+    detector = Detector(PACKAGE / "models" / "yolov5s.safetensors", score_threshold=0.5)
+    whole = detector.detect(color)
+    left, top = (min(getattr(d.box, side) for d in whole) for side in "xy")
+    right = max(d.box.x + d.box.width for d in whole)
+    bottom = max(d.box.y + d.box.height for d in whole)
+    where = Box(left, top, right - left, bottom - top)
+    found = detector.detect(color, where)
+    assert len(whole) == len(found) >= 8
+    for one in whole:
+        nearest = min(found, key=lambda d: math.dist(d.box.center, one.box.center))
+        assert math.dist(nearest.box.center, one.box.center) < 10
+    # What lies farther away than a window's margin is not looked at.
+    small = detector.detect(color, whole[0].box)
+    assert any(math.dist(d.box.center, whole[0].box.center) < 10 for d in small)
+    assert len(small) < len(whole)
 
 
 def test_a_missing_weight_file_says_how_to_make_it(tmp_path):

@@ -28,7 +28,7 @@ struct Light {
 };
 
 // A colour image after another of the same camera and light is traced anew only where an object that
-// has changed, or has moved by more than 0.1 mm, is or was seen, or shades or shaded what is seen.
+// has changed, or has moved by more than 0.3 mm, is or was seen, or shades or shaded what is seen.
 class Renderer {
  public:
   Renderer();

@@ -30,17 +30,20 @@ def support_plane(depth: np.ndarray) -> np.ndarray:
     if np.count_nonzero(valid) < 10:
         raise ValueError("depth image has no valid pixels to find the table in")
     scale = float(max(height, width))
-    basis = np.stack([u[valid] / scale, v[valid] / scale, np.ones(valid.sum())], axis=1)
+    a, b = u[valid] / scale, v[valid] / scale
+    one = np.ones_like(a)
+    basis = np.stack([a, b, one])
+    products = np.stack([a * a, a * b, a, b * b, b, one])  # of the normal equations
     target = z[valid].astype(np.float64)
     # The table lies between the object and what merging has mirrored below it.
     plane = np.array([0.0, 0.0, np.median(target)])
     for residual_scale in _PLANE_SCALES:
-        residual = (target - basis @ plane) / residual_scale
-        residual[residual < 0] *= 2
+        residual = (target - plane @ basis) / residual_scale
+        residual = np.maximum(residual, -2 * residual)
         weight = 1 / (1 + residual**2)
-        weighted = basis * weight[:, None]
-        normal = weighted.T @ basis + 1e-9 * np.eye(3)
-        plane = np.linalg.solve(normal, weighted.T @ target)
+        aa, ab, a1, bb, b1, n = products @ weight
+        normal = np.array([[aa, ab, a1], [ab, bb, b1], [a1, b1, n]]) + 1e-9 * np.eye(3)
+        plane = np.linalg.solve(normal, basis @ (weight * target))
     row = plane[0] * np.arange(width) / scale + plane[2]
     column = plane[1] * np.arange(height) / scale
     return (column[:, None] + row[None, :]).astype(np.float32)
@@ -53,21 +56,21 @@ def fill_holes(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """
     if valid.all():
         return values.astype(np.float32, copy=False)
-    weight = valid.astype(np.float32)
+    counts = valid.astype(np.float32)
     filled = np.where(valid, values, 0).astype(np.float32)
-    missing = ~valid
+    sums, pixels = filled.copy(), filled.ravel()
+    missing = np.flatnonzero(~valid)
     window = 5
-    sums, counts = filled.copy(), weight.copy()
-    while missing.any() and window <= max(values.shape):
+    while missing.size and window <= max(values.shape):
         blur = (window, window)
-        mean_weight = cv2.blur(counts, blur, borderType=cv2.BORDER_CONSTANT)
-        mean_value = cv2.blur(sums, blur, borderType=cv2.BORDER_CONSTANT)
-        found = missing & (mean_weight > 1e-6)
-        filled[found] = mean_value[found] / mean_weight[found]
-        missing &= ~found
+        weight = cv2.blur(counts, blur, borderType=cv2.BORDER_CONSTANT).ravel()[missing]
+        value = cv2.blur(sums, blur, borderType=cv2.BORDER_CONSTANT).ravel()[missing]
+        found = weight > 1e-6
+        pixels[missing[found]] = value[found] / weight[found]
+        missing = missing[~found]
         window = 4 * window + 1
-    if missing.any() and valid.any():  # nothing valid within half the image
-        filled[missing] = values[valid].mean()
+    if missing.size and valid.any():  # nothing valid within half the image
+        pixels[missing] = values[valid].mean()
     return filled
 
 

@@ -53,8 +53,8 @@ def decode_grasps(
 def expected_quality(
     q: np.ndarray, cos: np.ndarray, sin: np.ndarray, sigma: float, least: float = 0.0
 ) -> np.ndarray:
-    """Gaussian mean of the quality along the jaws, across each pixel's closing direction; 0 where no
-    q is above `least` within its reach, for the mean is not either."""
+    """Gaussian mean of the quality along the jaws, across each pixel's closing direction; 0 where
+    no q is above `least` within its reach, for the mean is not either."""
     mean = np.zeros_like(q)
     reach = int(np.ceil(2 * sigma))
     good = q > least

@@ -107,6 +107,21 @@ def object_mask(
         return empty - measured > min_height
 
 
+def standing(
+    heights: np.ndarray, empty_depth: np.ndarray, part: Box, min_height: float
+) -> Box | None:
+    """The box, in a part of the image, of what is higher over the empty scene than min_height (m)
+    or was not measured where the empty scene was; specks apart. None where nothing is.
+
+    heights: (H, W) m (grasp_view.without_gaps); empty_depth: (H, W) m.
+    """
+    height, empty = heights[part.slices], empty_depth[part.slices]
+    there = np.where(np.isnan(height), np.isfinite(empty), height > min_height).astype(np.uint8)
+    there = cv2.morphologyEx(there, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+    x, y, width, height = cv2.boundingRect(there)
+    return Box(part.x + x, part.y + y, width, height) if width else None
+
+
 def distinct_objects(
     logits: np.ndarray,
     windows: Sequence[Window],

@@ -28,12 +28,14 @@ from iwgnet_grasp.perception.merged_depth import (
     object_mask,
     own_share,
     pixel_owners,
+    standing,
     taken_away,
     unexplained_surfaces,
 )
 from iwgnet_grasp.perception.rims import rim_grasps
 from iwgnet_grasp.perception.types import (
     NOBODY,
+    Box,
     Detection,
     GraspRectangle,
     Look,
@@ -53,7 +55,7 @@ class ObjectDetector(Protocol):
     backend: str
     region: Region  # of the image, where it looks
 
-    def detect(self, color: np.ndarray) -> list[Detection]: ...
+    def detect(self, color: np.ndarray, where: Box | None = None) -> list[Detection]: ...
 
 
 class WindowGrasps(Protocol):
@@ -217,7 +219,9 @@ class Perception:
                 )
         view = _View.of(color, depth, empty_depth)
         checked = time.perf_counter()
-        detections = self.detector.detect(color)
+        part = self._looked_at(depth.shape)
+        where = standing(view.heights, empty_depth, part, self.config.min_height)
+        detections = self.detector.detect(color, where)
         detected = time.perf_counter()
         detections, owners = self._distinct(view, detections)
         masked = time.perf_counter()
@@ -243,6 +247,12 @@ class Perception:
         }
         owners = np.where(np.isin(look.owners, list(taken)), NOBODY, look.owners)
         return self._estimate(view, left, owners, {}, strict=True)
+
+    def _looked_at(self, shape: tuple[int, ...]) -> Box:
+        """The detector's region in an image (H, W)."""
+        left, right = (round(shape[1] * part) for part in self.detector.region[::2])
+        top, bottom = (round(shape[0] * part) for part in self.detector.region[1::2])
+        return Box(left, top, right - left, bottom - top)
 
     def _distinct(
         self, view: _View, detections: Sequence[Detection]
@@ -274,10 +284,9 @@ class Perception:
         owners = pixel_owners(
             logits[kept], [windows[i] for i in kept], [d.box for d in detections], seen.shape
         )
-        x1, x2 = (round(seen.shape[1] * part) for part in self.detector.region[::2])
-        y1, y2 = (round(seen.shape[0] * part) for part in self.detector.region[1::2])
         looked_at = np.zeros_like(seen)
-        looked_at[y1:y2, x1:x2] = seen[y1:y2, x1:x2]
+        part = self._looked_at(seen.shape).slices
+        looked_at[part] = seen[part]
         label = detections[0].label if detections else UNKNOWN
         for box, surface in unexplained_surfaces(looked_at, owners, config.min_unexplained_pixels):
             owners[box.slices][surface] = len(detections)
