@@ -55,10 +55,15 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
       return (p - center).norm() > kNeighbour ||
              outside(p + (way - met + kStep) * along) <= outside(p + (way - met) * along);
     };
-    // The body's front, for the rest of it comes where that has been.
+    // Where the body's front has been there is room for the rest of it.
+    const auto front_is_free = [&](double first, double last) {
+      return free(from + (kBody.x() + (first + last) / 2) * along,
+                  {(last - first) / 2, kBody.y()}, kBodyAbove);
+    };
+    if (!front_is_free(0.0, met)) return false;
     const auto goes_on = [&] {
       return std::all_of(objects.begin(), objects.end(), stays) &&
-             free(from + (way + kBody.x()) * along, {kStep, kBody.y()}, kBodyAbove);
+             front_is_free(way, way + kStep);
     };
     while (way - met < config.distance && goes_on()) way += kStep;
     if (way - met < config.min_distance) return false;
