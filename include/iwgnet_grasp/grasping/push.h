@@ -19,7 +19,8 @@ struct PushConfig {       // config/motion.yaml, section "push"
   double speed;           // m/s of the tool
 };
 
-// The tips go down at `from`, closing direction across the way, and move straight to `to`.
+// The tips go down at `from`, closing direction along the way, so that nothing comes between the pads,
+// and move straight to `to`: the back of one finger pushes.
 struct Push {
   Eigen::Vector2d from, to;  // m, base_link
   double tip_height;         // m over the table
