@@ -81,7 +81,7 @@ std::vector<Push> find_pushes(const HeightMap& heights, const std::vector<Eigen:
     for (int i = 0; i < kDirections; ++i) {
       const double angle = 2 * M_PI * i / kDirections;
       for (const double tip : config.tip_heights)  // high: what lies below stays where it is
-        if (object.z() > tip + config.clearance &&
+        if (object.z() > tip + config.overlap &&
             try_push(object.head<2>(), {std::cos(angle), std::sin(angle)}, tip))
           break;
     }

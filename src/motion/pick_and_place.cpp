@@ -184,6 +184,7 @@ PickPlaceConfig load_pick_place_config(const std::string& config_dir) {
   const auto& heights = config.push.tip_heights = file.get<std::vector<double>>("push.tip_heights");
   if (heights.empty() || !std::is_sorted(heights.rbegin(), heights.rend()) || !(heights.back() > 0))
     file.fail("push.tip_heights", "needs heights above 0, the highest first");
+  config.push.overlap = positive("push.overlap");
   config.push.clearance = positive("push.clearance");
   config.push.run_up = positive("push.run_up");
   config.push.distance = positive("push.distance");

@@ -101,6 +101,18 @@ TEST(Push, LeavesWhatLiesBelowTheObject) {
   for (const Push& push : lower) EXPECT_DOUBLE_EQ(push.tip_height, 0.007);
 }
 
+TEST(Push, MeetsTheObjectBelowItsTop) {
+  Table table;
+  table.add(kMiddle.x(), kMiddle.y(), {0.10, 0.02, 0.03});
+  table.config.tip_heights = {0.025, 0.007};
+  table.config.overlap = 0.010;
+  for (const Push& push : table.pushes({{kMiddle.x(), kMiddle.y(), 0.03}}))
+    EXPECT_DOUBLE_EQ(push.tip_height, 0.007);
+  table.config.overlap = 0.003;
+  for (const Push& push : table.pushes({{kMiddle.x(), kMiddle.y(), 0.03}}))
+    EXPECT_DOUBLE_EQ(push.tip_height, 0.025);
+}
+
 TEST(Push, NeedsRoomForTheFingers) {
   Table table;
   table.add(kMiddle.x(), kMiddle.y(), {0.30, 0.30, 0.03});
