@@ -98,9 +98,7 @@ class Detector:
         whole = np.array(self.input_size)
         first = np.clip([y1 - MARGIN, x1 - MARGIN], 0, whole)
         last = np.clip([y2 + MARGIN, x2 + MARGIN], 0, whole)
-        size = min(
-            (s for s in self._runners if (last - first <= s).all()), key=lambda s: s[0] * s[1]
-        )
+        size = next(size for size in self._runners if (last - first <= size).all())
         top, left = np.clip(np.rint((first + last - size) / 2).astype(int), 0, whole - size)
         window = fitted[top : top + size[0], left : left + size[1]]
         return window, replace(fit, left=fit.left - left, top=fit.top - top)
