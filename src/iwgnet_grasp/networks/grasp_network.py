@@ -49,7 +49,7 @@ class GraspNetwork(nn.Module):
 
     def forward(self, x: Tensor) -> GraspMaps:
         logits = self.logits(x)
-        # By way of flat maps: to split its own layout of images takes OpenVINO 10 % of IWGNet's time.
+        # By way of flat maps: splitting its own layout of images takes OpenVINO 10 % of the time.
         flat = logits.flatten(2).unbind(1)
         q, cos, sin, width = (one.reshape(logits[:, 0].shape) for one in flat)
         quality = torch.sigmoid(q)
