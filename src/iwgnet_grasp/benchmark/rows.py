@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
+import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -240,13 +242,22 @@ def _physics(run: Run) -> Result:
 
 
 def _trial_in_process(run: Run) -> Result:
-    trial = _ten_in_process()
-    return Result(
-        "trial_in_process",
-        trial["sim_time_s"] / trial["wall_time_s"],
-        "x real time",
-        f"ten_stacked, {trial['sim_time_s']:.0f} s simulated, all computing included",
-    )
+    from iwgnet_grasp.trials.batch import read_summary
+
+    core = str(min(os.sched_getaffinity(0)))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        trials = ["-m", "iwgnet_grasp.trials", "--scene", "ten_stacked", "--trials", "5"]
+        ran = command(
+            ["taskset", "--cpu-list", core, sys.executable, *trials, "--out", str(out)],
+            timeout_s=900,
+        )
+        if ran.returncode != 0:
+            raise BenchmarkError(last_line(ran.stderr))
+        scene = read_summary(out)["scenes"]["ten_stacked"]
+    detail = f"5 of ten_stacked, {scene['sim_time_s']:.0f} s simulated, all computing on one core"
+    goal = Goal(8, at_least=True)
+    return Result("trial_in_process", scene["times_real"], "x real time", detail, goal)
 
 
 def _ros_trial(scene: str, seed: int) -> tuple[dict, float]:
@@ -315,7 +326,7 @@ ROWS = (
     Row("detector", "the detector on one image", _detector),
     Row("look", "detection, IWGNet and order of a pile of ten", _look),
     Row("labels", "labelled samples from settled scenes", _labels),
-    Row("trial_in_process", "a ten-object trial in one process", _trial_in_process),
+    Row("trial_in_process", "ten-object trials in one process on one core", _trial_in_process),
     Row("trial_ros", "the five-object trial in one command", _trial_ros),
     Row("trial_ros_speed", "the five-object trial against real time", _trial_ros_speed),
     Row("success", "five-object trials, seeds 0-9, by the judge", _success),
