@@ -72,11 +72,6 @@ def median_seconds(body: Callable[[], object], runs: int = 30, warm_up: int = 3)
     return statistics.median(times)
 
 
-def module(*arguments: str, timeout_s: float) -> subprocess.CompletedProcess:
-    """Runs `python -m ...` in the package's folder."""
-    return command([sys.executable, "-m", *arguments], timeout_s)
-
-
 def command(words: list[str], timeout_s: float) -> subprocess.CompletedProcess:
     try:
         return subprocess.run(

@@ -19,7 +19,6 @@ from iwgnet_grasp.benchmark.measure import (
     core,
     last_line,
     median_seconds,
-    module,
     peer,
 )
 
