@@ -114,8 +114,11 @@ def _trials_markdown(report: Report, others: Sequence[dict], pictures: Path) -> 
             f"### {title}\n\n`{command_line(run)}`: {conditions_line(run)}.{_code(summary)}"
         )
         text.append(markdown(*_without_empty(*success_rows(summary))))
-        text.append("Failed trials by what failed first:")
-        text.append(markdown(*_without_empty(*cause_rows(summary))))
+        if _failed(summary):
+            text.append("Failed trials by what failed first:")
+            text.append(markdown(*_without_empty(*cause_rows(summary))))
+        else:
+            text.append("No trial failed.")
     text += [_comparison_markdown(comparison, pictures) for comparison in others]
     for example in report.examples:
         record = example.record
@@ -225,8 +228,19 @@ def _overview(report: Report) -> str:
     )
 
 
+def _failed(summary: dict) -> bool:
+    return any(scene["successes"] < scene["trials"] for scene in summary["scenes"].values())
+
+
 def _run_html(title: str, summary: dict) -> str:
     run = summary["run"]
+    failures = ["<h3>No trial failed</h3>"]
+    if _failed(summary):
+        failures = [
+            "<h3>Failed trials by what failed first</h3>",
+            f"<figure>{figures.as_svg(figures.cause_figure(summary))}</figure>",
+            _table(*_without_empty(*cause_rows(summary))),
+        ]
     return "\n".join(
         [
             f"<h2>{html.escape(title)}</h2>",
@@ -236,9 +250,7 @@ def _run_html(title: str, summary: dict) -> str:
             "<p>GSR: grasps that succeed of all that were tried. Pushes: objects pushed aside, not "
             "gripped, where no grasp was good (the paper has none). Slip and placement: median / "
             "largest. picks/h counts computation at its wall time.</p>",
-            "<h3>Failed trials by what failed first</h3>",
-            f"<figure>{figures.as_svg(figures.cause_figure(summary))}</figure>",
-            _table(*_without_empty(*cause_rows(summary))),
+            *failures,
         ]
     )
 
