@@ -239,6 +239,7 @@ TEST(Labels, HexagonIsHeldByItsEdges) {
   for (int i = 0; i < 6; ++i)
     hexagon.emplace_back(0.0208f * std::cos(i * M_PI / 3), 0.0208f * std::sin(i * M_PI / 3));
   Bench bench;
+  bench.pose_config.insertion_depth = 0.018 + 0.010;  // the edges lie 18 mm below the upper side
   const TriangleMesh mesh = prism_mesh(hexagon, 0.1f);
   const PartGrasps grasps = bench.grasps(mesh);
   bench.add(mesh, grasps, lying(0.5, 0.0, 0.018));

@@ -135,7 +135,9 @@ TEST_F(PickCycle, PushesAPartAsideWithoutAttemptingToGraspIt) {
                                           cell->config()));
   const Pose before = cell->world().part(1).T_base_part;
   const double start = cell->time();
-  const PickResult result = picker->push(robot, {before.translation()});
+  Eigen::Vector3d seen = before.translation();
+  seen.z() *= 2;  // it lies on the table: the middle of its upper side
+  const PickResult result = picker->push(robot, {seen});
   EXPECT_EQ(result.reason, PickReason::kSucceeded) << result.message;
   EXPECT_GT(moved(1, before), 0.02);
   EXPECT_LT(moved(1, before), 0.15);

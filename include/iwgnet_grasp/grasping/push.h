@@ -11,7 +11,8 @@ namespace iwgnet_grasp::grasping {
 struct PushConfig {       // config/motion.yaml, section "push"
   double gap;             // m between the pads while pushing
   std::vector<double> tip_heights;  // m, finger tips over the table, the highest first
-  double overlap;         // m, least, that the object's visible centroid is higher than the tips
+  double overlap;         // m, least, that the object's visible centroid is higher than the tips: what
+                          // is lower than the lowest tips and this is not pushed
   double clearance;       // m, tips over whatever lies where they go down
   double run_up;          // m from the object's centroid at most, to where they go down
   double distance, min_distance;  // m that the fingers go on once they meet something, as far as the
