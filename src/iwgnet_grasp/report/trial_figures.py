@@ -175,7 +175,8 @@ def _points(axes, points: Sequence[tuple[float, int, int]], color, marker, label
 def _finish(axes, legend: bool = True) -> None:
     """Percent from a round figure below the lowest interval to 100, legend beside the plot."""
     lowest = axes.dataLim.y0 if axes.has_data() else 0.0
-    axes.set_ylim(max(0.0, 10 * math.floor((lowest - 2) / 10)) - 0.5, 101)
+    bottom = max(0.0, 10 * math.floor((lowest - 2) / 10))
+    axes.set_ylim(bottom - 0.5, 100 + 0.03 * (100 - bottom))  # whole markers at 100, too
     axes.grid(axis="y", color="#e6e6e3", linewidth=0.8)
     axes.set_axisbelow(True)
     if legend:
