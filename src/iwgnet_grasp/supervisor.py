@@ -43,6 +43,10 @@ class Outcome:
     reason: str = ""  # snake_case name of a PickPlace.action reason: missed, lost, no_plan, ...
     message: str = ""
 
+    @property
+    def executed(self) -> bool:
+        return self.reason not in NOT_EXECUTED
+
 
 class Cell(Protocol):
     """What the supervisor asks of a transport. Calls block; errors that end a trial are raised
@@ -133,7 +137,7 @@ class Attempt:
 
     @property
     def executed(self) -> bool:
-        return self.outcome.reason not in NOT_EXECUTED
+        return self.outcome.executed
 
 
 @dataclass
@@ -197,7 +201,7 @@ def clear_table(
         if targets and best < settings.push_below and may_push:
             pushes += 1
             outcome = cell.push(scene_id)
-            if outcome.reason not in NOT_EXECUTED:  # one that broke off has moved the parts as well
+            if outcome.executed:  # one that broke off may have moved the parts as well
                 cycle.pushes += 1
                 broke_off = "" if outcome.success else f"; it broke off: {outcome.message}"
                 say(

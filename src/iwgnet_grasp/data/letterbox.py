@@ -21,6 +21,13 @@ def checked_region(value: Sequence[float]) -> Region:
     return left, top, right, bottom
 
 
+def region_corners(shape: Sequence[int], region: Region) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom px of the region of an image (rows, columns, ...)."""
+    left, right = (round(shape[1] * part) for part in region[::2])
+    top, bottom = (round(shape[0] * part) for part in region[1::2])
+    return left, top, right, bottom
+
+
 @dataclass(frozen=True)
 class Letterbox:
     """How an image was fitted into the network's input: input px = scale * image px + offset."""
@@ -46,9 +53,7 @@ def letterbox(
 
     Pixels here count from the image's corner: a box's edge lies on the border of two pixels.
     """
-    rows, columns = image.shape[:2]
-    x1, x2 = (round(columns * part) for part in region[::2])
-    y1, y2 = (round(rows * part) for part in region[1::2])
+    x1, y1, x2, y2 = region_corners(image.shape, region)
     image = image[y1:y2, x1:x2]
     rows, columns = image.shape[:2]
     scale = min(size[0] / rows, size[1] / columns)

@@ -15,7 +15,7 @@ import numpy as np
 
 from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.grasp_rectangle import angle_between, wrap_theta
-from iwgnet_grasp.data.letterbox import Region, checked_region
+from iwgnet_grasp.data.letterbox import Region, checked_region, region_corners
 from iwgnet_grasp.files import read_config
 from iwgnet_grasp.perception.grasp_view import grasp_view, without_gaps
 from iwgnet_grasp.perception.merged_depth import (
@@ -250,8 +250,7 @@ class Perception:
 
     def _looked_at(self, shape: tuple[int, ...]) -> Box:
         """The detector's region in an image (H, W)."""
-        left, right = (round(shape[1] * part) for part in self.detector.region[::2])
-        top, bottom = (round(shape[0] * part) for part in self.detector.region[1::2])
+        left, top, right, bottom = region_corners(shape, self.detector.region)
         return Box(left, top, right - left, bottom - top)
 
     def _distinct(
