@@ -33,6 +33,7 @@ class Target:
     feasible: bool
     reason: str = ""  # why not feasible
     quality: float = 0.0  # of the grasp pose, [0, 1]: the network's, less what geometry takes off
+    covered_px: int = 0  # of the object's border with one that lies on it
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,7 @@ class Settings:
     max_attempts: int
     max_idle_looks: int
     min_quality: float
+    max_covered_px: int
     push_below: float
     max_pushes: int
 
@@ -98,8 +100,10 @@ class Settings:
             value = getattr(self, key)
             if not (isinstance(value, int) and value > 0):
                 raise ValueError(f"{key}: {value!r} is not a whole number above 0")
-        if not (isinstance(self.max_pushes, int) and self.max_pushes >= 0):
-            raise ValueError(f"max_pushes: {self.max_pushes!r} is not a whole number from 0")
+        for key in ("max_covered_px", "max_pushes"):
+            value = getattr(self, key)
+            if not (isinstance(value, int) and value >= 0):
+                raise ValueError(f"{key}: {value!r} is not a whole number from 0")
         for key in ("min_quality", "push_below"):
             if not isinstance(getattr(self, key), int | float):
                 raise ValueError(f"{key}: {getattr(self, key)!r} is not a number")
@@ -168,13 +172,22 @@ def pick_line(number: int, attempt: Attempt) -> str:
     )
 
 
-def execution_order(targets: Sequence[Target], min_quality: float) -> list[Target]:
-    """The feasible targets in the order in which they are picked: as given (by priority) where the
-    grasp is good, then the doubtful ones, below min_quality, by descending quality. The paper's
-    score does not see how good a grasp is, and a doubtful one often becomes good once what lies on
-    or beside the object is gone."""
-    feasible = [target for target in targets if target.feasible]
-    return sorted(feasible, key=lambda t: -min(t.quality, min_quality))
+def execution_order(
+    targets: Sequence[Target], min_quality: float, max_covered_px: int
+) -> list[Target]:
+    """The feasible targets in the order in which they are picked.
+
+    Objects that lie under others come after all that do not, least covered first: taken from
+    beneath they move what lies on them. Of the free ones those with a good grasp come as given (by
+    priority), then the doubtful ones, below min_quality, by descending quality. The paper's score
+    does not see how good a grasp is, and a doubtful one often becomes good once what lies beside
+    the object is gone.
+    """
+
+    def key(target: Target) -> tuple[float, float]:
+        return max(target.covered_px, max_covered_px), -min(target.quality, min_quality)
+
+    return sorted((target for target in targets if target.feasible), key=key)
 
 
 def clear_table(
@@ -195,7 +208,7 @@ def clear_table(
         scene_id = cell.look()
         cycle.looks += 1
         targets = cell.plan(scene_id, cycle.failed)
-        graspable = execution_order(targets, settings.min_quality)
+        graspable = execution_order(targets, settings.min_quality, settings.max_covered_px)
         best = max((target.quality for target in graspable), default=0.0)
         may_push = settings.replan == "every" and pushes < settings.max_pushes
         if targets and best < settings.push_below and may_push:
@@ -245,7 +258,7 @@ def clear_table(
                 break
             targets = cell.plan(scene_id, cycle.failed, taken)
             left = [t for t in targets if t.object_id not in tried]
-            graspable = execution_order(left, settings.min_quality)
+            graspable = execution_order(left, settings.min_quality, settings.max_covered_px)
         if settings.replan == "once":
             cycle.ended = "sequence_done"
             return cycle

@@ -237,7 +237,7 @@ def test_network_input_is_the_height_above_the_table():
     assert height[:90].mean() == pytest.approx(0, abs=0.01)
     assert height.max() == HEIGHT_CLIP[1]
     # The same with and without the empty scene, as in training and on the robot.
-    with_empty = normalise_depth(depth, table(seed=1))
+    with_empty = normalise_depth(depth, support_plane(table(seed=1)))
     assert np.abs(with_empty - height).max() < 0.02
 
 

@@ -76,7 +76,7 @@ def test_an_augmented_window_keeps_image_and_mask_together(tmp_path):
     from iwgnet_grasp.data.augmentation import Augmentation
 
     views = load_mask_views([write_set(tmp_path, 3)])
-    dataset = MaskDataset(views, INPUT_PX, Augmentation(noise=0, tilt=0, holes=0), (1, 2))
+    dataset = MaskDataset(views, Augmentation(noise=0, tilt=0, holes=0), (1, 2))
     for i in range(3):
         (height, grey), mask = dataset[i]
         inside = mask > 0
@@ -94,7 +94,7 @@ def test_upright_boxes_stay_upright_where_only_quarter_turns_are_made(tmp_path):
     change = Augmentation(noise=0, tilt=0, holes=0, any_turn=False)
     shapes = set()
     for seed in range(12):
-        _, mask = MaskDataset(views, INPUT_PX, change, (seed,))[0]
+        _, mask = MaskDataset(views, change, (seed,))[0]
         x, y, width, height = cv2.boundingRect(mask.numpy().astype(np.uint8))
         assert mask[y : y + height, x : x + width].mean() > 0.97  # the bar fills its box
         shapes.add(width > height)

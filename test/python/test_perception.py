@@ -29,11 +29,13 @@ from iwgnet_grasp.perception.merged_depth import (
     crop_window,
     distinct_objects,
     grasp_depth,
+    lies_on,
     merge,
     metres,
     object_mask,
     own_share,
     pixel_owners,
+    same_parts,
     standing,
     taken_away,
 )
@@ -192,10 +194,48 @@ def test_where_an_object_was_taken_away_the_empty_scene_is_seen():
     owners = np.full(depth.shape, -1, np.int16)
     owners[202:238, 317:345] = 0  # but for its edges
     owners[200:240, 345:360] = 1
-    left = taken_away(depth, table(), owners, [0])
+    left, left_owners = taken_away(depth, table(), owners, [0], 0.008)
     expected = table()
     expected[200:240, 345:360] = TABLE - 0.04
     np.testing.assert_array_equal(left, expected)
+    assert set(np.unique(left_owners)) == {-1, 1}
+
+
+def crossing_bars(slope=0.0):
+    """Depth (m) and owners of a bar, 1, that rises by `slope` a px, with a higher bar, 0, across
+    it; and the depth without that."""
+    rows, columns = np.mgrid[0:480, 0:640]
+    below = table()
+    lower = (rows >= 210) & (rows < 230) & (columns >= 270) & (columns < 470)
+    below[lower] = (TOP - slope * (columns - 270))[lower]
+    depth = below.copy()
+    depth[160:280, 320:340] = TABLE - 0.06
+    owners = np.where(lower, 1, -1).astype(np.int16)
+    owners[160:280, 320:340] = 0
+    return depth, owners, below
+
+
+def test_an_object_goes_on_beneath_what_was_taken_from_it():
+    depth, owners, below = crossing_bars(slope=1e-4)  # 20 mm in all
+    left, left_owners = taken_away(depth, table(), owners, [0], 0.008)
+    np.testing.assert_allclose(left, below, atol=2e-4)
+    np.testing.assert_array_equal(left_owners == 1, below < TABLE - 0.004)
+    # Nothing is known to be hidden by what stands beside it, no higher than it does.
+    depth[owners == 0] = TOP
+    left, left_owners = taken_away(depth, table(), owners, [0], 0.008)
+    assert np.all(left[160:280, 320:340] == np.float32(TABLE))
+    assert np.all(left_owners[160:280, 320:340] == -1)
+
+
+def test_what_crosses_higher_lies_on_the_other():
+    depth, owners, _ = crossing_bars()
+    heights = table() - depth
+    count = lies_on(owners, heights, 0.004)
+    # Two borders of 20 px, passed by steps of 6 px at most in three of four directions.
+    assert 2 * 20 * 4 < count[1, 0] < 2 * 20 * 6 * 3
+    assert count[0, 1] == -count[1, 0] and count[0, 0] == count[1, 1] == 0
+    assert not lies_on(owners, np.where(owners == 0, heights[220, 300], heights), 0.004).any()
+    assert lies_on(np.full((4, 5), -1, np.int16), np.zeros((4, 5)), 0.004).shape == (0, 0)
 
 
 def test_a_part_is_covered_where_something_higher_stands_beside_it():
@@ -326,6 +366,18 @@ class AsGood:
         return np.repeat(1 - near.mean((1, 2))[:, None], 2, axis=1)
 
 
+class SameRow:
+    """Patches: what stands in the rows of a patch is of the same part."""
+
+    backend = "none"
+
+    def predict(
+        self, heights: np.ndarray, grey: np.ndarray, patches: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        shape = heights.shape
+        return [np.broadcast_to(p.any(1)[:, None], shape).astype(np.float32) for p in patches]
+
+
 @pytest.fixture
 def config() -> PerceptionConfig:
     return PerceptionConfig.load()
@@ -337,7 +389,7 @@ def color(shape=(480, 640)) -> np.ndarray:
 
 def test_a_look_gives_grasps_in_pixels_of_the_full_image(config):
     boxes = KnownBoxes(BOX, Box(10, 10, 40, 40))
-    perception = Perception(config, boxes, HighestPoint(), AllOfTheBox(), AsGood())
+    perception = Perception(config, boxes, HighestPoint(), AllOfTheBox(), AsGood(), SameRow())
     look = perception.look(color(), scene(), table())
     first, second = look.objects
     assert (first.object_id, second.object_id) == (0, 1)
@@ -377,8 +429,10 @@ def test_a_box_counts_when_its_mask_shows_what_no_better_one_does():
 def test_what_stands_there_without_a_box_is_an_object(config):
     depth = scene()
     depth[300:330, 100:200] = TOP  # 3000 px
-    depth[400:420, 100:150] = TOP  # 1000 px
-    perception = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood())
+    depth[400:420, 100:140] = TOP  # 800 px
+    perception = Perception(
+        config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
+    )
     look = perception.look(color(), depth, table())
     known, found = look.objects
     assert known.box == BOX and found.box == Box(100, 300, 100, 30)
@@ -386,16 +440,49 @@ def test_what_stands_there_without_a_box_is_an_object(config):
     assert found.valid_pixels == 3000 and len(found.grasps) == 1
     elsewhere = KnownBoxes(BOX)
     elsewhere.region = (0.4, 0.0, 1.0, 1.0)  # the detector does not look there: a tray, say
-    perception = Perception(config, elsewhere, HighestPoint(), AllOfTheBox(), AsGood())
+    perception = Perception(config, elsewhere, HighestPoint(), AllOfTheBox(), AsGood(), SameRow())
     assert len(perception.look(color(), depth, table()).objects) == 1
+
+
+def test_what_lies_on_both_sides_of_another_object_is_one(config):
+    depth = table()
+    depth[210:230, 270:470] = TOP
+    depth[160:280, 360:380] = TABLE - 0.04
+    upper = Box(360, 160, 20, 120)
+    perception = Perception(
+        config, KnownBoxes(upper), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
+    )
+    look = perception.look(color(), depth, table())
+    assert [(o.score, o.box) for o in look.objects] == [(0.9, upper), (0.0, Box(270, 210, 200, 20))]
+    assert [o.valid_pixels for o in look.objects] == [120 * 20, 180 * 20]
+    assert look.objects[0].covered_px == 0 and look.objects[1].covered_px > 50
+
+
+def test_pieces_are_joined_from_the_likeliest_pair_on():
+    nan = math.nan
+    alike = np.array(
+        [
+            [nan, nan, nan, nan],
+            [nan, nan, nan, nan],
+            [0.6, 0.9, 1.0, 0.2],
+            [0.8, 0.1, 0.6, 1.0],
+        ]
+    )
+    # 2 goes to 1 and 3 to 0; 2 and 3 (0.4) stay apart, as must 0 and 1.
+    assert same_parts(alike, [True, True, False, False], 0.5) == [[0, 3], [1, 2]]
+    assert same_parts(alike, [True, True, False, False], 0.85) == [[0], [1, 2], [3]]
+    assert same_parts(alike, [False] * 4, 0.5) == [[0, 1, 2, 3]]
+    assert same_parts(np.empty((0, 0)), [], 0.5) == []
 
 
 def test_a_grasp_counts_for_less_where_its_outcome_looks_bad(config):
     depth = scene()
     depth[200:240, 350:400] = TOP  # another object beside it
     beside = Box(350, 200, 50, 40)
-    alone = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood())
-    crowded = Perception(config, KnownBoxes(BOX, beside), HighestPoint(), AllOfTheBox(), AsGood())
+    alone = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood(), SameRow())
+    crowded = Perception(
+        config, KnownBoxes(BOX, beside), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
+    )
     (first,) = alone.look(color(), scene(), table()).objects
     second = crowded.look(color(), depth, table()).objects[0]
     assert first.grasps[0].quality == pytest.approx(0.7)
@@ -403,31 +490,26 @@ def test_a_grasp_counts_for_less_where_its_outcome_looks_bad(config):
 
 
 def test_a_look_without_an_object_shows_what_lay_behind_it(config):
-    # A bar that lies across another, whose box shows it.
-    depth = table()
-    depth[210:230, 270:470] = TOP
-    depth[160:280, 320:340] = TABLE - 0.04
+    depth, _, below = crossing_bars()  # the box of the lower one shows the other as well
     upper, lower = Box(320, 160, 20, 120), Box(270, 210, 200, 20)
     perception = Perception(
-        config, KnownBoxes(upper, lower), HighestPoint(), AllOfTheBox(), AsGood()
+        config, KnownBoxes(upper, lower), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
     )
     look = perception.look(color(), depth, table())
     left = perception.without(look, [0])
     (seen,) = left.objects
     assert (seen.object_id, seen.box) == (1, lower)
-    assert seen.valid_pixels == look.objects[1].valid_pixels
+    assert look.objects[1].covered_px > 0 and seen.covered_px == 0
+    assert look.objects[1].valid_pixels == 180 * 20 and seen.valid_pixels == 200 * 20
     assert seen.grasps[0].quality > look.objects[1].grasps[0].quality  # it is covered no more
-    expected = table()
-    expected[210:230, 270:320] = expected[210:230, 340:470] = TOP
-    strip = left.depth.copy()
-    strip[:, 312:348] = expected[:, 312:348]  # the upper one's edges
-    np.testing.assert_array_equal(strip, expected)
-    assert np.all(left.depth[160:280, 320:340] == np.float32(TABLE))
+    np.testing.assert_allclose(left.depth, below, atol=1e-4)
     assert perception.without(look, [0, 1]).objects == ()
 
 
 def test_an_empty_table_is_no_error(config):
-    perception = Perception(config, KnownBoxes(), HighestPoint(), AllOfTheBox(), AsGood())
+    perception = Perception(
+        config, KnownBoxes(), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
+    )
     look = perception.look(color(), table(), table())
     assert look.objects == () and look.windows == ()
 
@@ -444,7 +526,9 @@ def test_an_empty_table_is_no_error(config):
     ],
 )
 def test_bad_images_are_refused_by_name(config, change, complaint):
-    perception = Perception(config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood())
+    perception = Perception(
+        config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
+    )
     images = {"color": color(), "depth": scene(), "empty_depth": table()} | change
     with pytest.raises(PerceptionError, match=complaint) as caught:
         perception.look(**images)

@@ -136,8 +136,17 @@ def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():
         Target(1, i, "connecting_rod", 0.9, 1.0 - 0.1 * i, grasp, i != 4, quality=q)
         for i, q in qualities.items()
     ]
-    assert [t.object_id for t in execution_order(targets, 0.3)] == [1, 3, 2, 0]
-    assert [t.object_id for t in execution_order(targets, 0.0)] == [0, 1, 2, 3]
+    assert [t.object_id for t in execution_order(targets, 0.3, 0)] == [1, 3, 2, 0]
+    assert [t.object_id for t in execution_order(targets, 0.0, 0)] == [0, 1, 2, 3]
+
+
+def test_what_lies_under_another_object_waits_for_it():
+    grasp = GraspRectangle(10.0, 5.0, 0.1, 20.0, 0.8, 0.58)
+    targets = [
+        Target(1, i, "connecting_rod", 0.9, 0.5, grasp, True, quality=q, covered_px=c)
+        for i, (q, c) in enumerate([(0.9, 40), (0.9, 30), (0.1, 12), (0.9, 14)])
+    ]
+    assert [t.object_id for t in execution_order(targets, 0.3, 15)] == [3, 2, 1, 0]
 
 
 def test_where_no_grasp_is_good_an_object_is_pushed_aside_and_it_looks_again():

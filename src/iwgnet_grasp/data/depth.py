@@ -16,9 +16,11 @@ def valid_depth(depth: np.ndarray) -> np.ndarray:
     return np.isfinite(depth) & (depth > 0)
 
 
-def support_plane(depth: np.ndarray) -> np.ndarray:
+def support_plane(depth: np.ndarray, around: tuple[int, int, int, int] | None = None) -> np.ndarray:
     """Depth [H, W] (m) of the plane that most of the image shows.
 
+    around: (top, left, height, width) of a larger image that this one is a part of, the upper left
+    corner counted from this one's and not positive: the plane there.
     Iteratively reweighted least squares of z = a u + b v + c with Cauchy weights; pixels nearer
     than the plane, which are objects, lose weight twice as fast as farther ones. ValueError when
     fewer than ten samples are valid.
@@ -44,8 +46,9 @@ def support_plane(depth: np.ndarray) -> np.ndarray:
         aa, ab, a1, bb, b1, n = products @ weight
         normal = np.array([[aa, ab, a1], [ab, bb, b1], [a1, b1, n]]) + 1e-9 * np.eye(3)
         plane = np.linalg.solve(normal, basis @ (weight * target))
-    row = plane[0] * np.arange(width) / scale + plane[2]
-    column = plane[1] * np.arange(height) / scale
+    top, left, rows, columns = around or (0, 0, height, width)
+    row = plane[0] * np.arange(left, left + columns) / scale + plane[2]
+    column = plane[1] * np.arange(top, top + rows) / scale
     return (column[:, None] + row[None, :]).astype(np.float32)
 
 
@@ -74,15 +77,15 @@ def fill_holes(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return filled
 
 
-def normalise_depth(depth: np.ndarray, empty: np.ndarray | None = None) -> np.ndarray:
+def normalise_depth(depth: np.ndarray, table: np.ndarray | None = None) -> np.ndarray:
     """Network input [H, W] float32: height above the table in units of HEIGHT_UNIT, holes filled.
 
-    depth: m, invalid where not finite or <= 0. The table is the plane fitted to `empty`, the depth
-    of the same view without objects, where there is one, else to `depth` itself. The plane and not
-    the pixels of `empty` is subtracted, so that noise, holes and what a merged depth took over from
-    the empty scene look alike with and without it.
+    depth: m, invalid where not finite or <= 0. table: depth of the table's plane where it is known
+    (support_plane of the empty scene), else it is fitted to `depth` itself. The plane and not the
+    pixels of the empty scene is subtracted, so that noise, holes and what a merged depth took over
+    from it look alike in both cases.
     """
-    plane = support_plane(depth if empty is None else empty)
+    plane = support_plane(depth) if table is None else table
     valid = valid_depth(depth)
     height = np.where(valid, (plane - depth) / HEIGHT_UNIT, 0)
     return np.clip(fill_holes(height, valid), *HEIGHT_CLIP)

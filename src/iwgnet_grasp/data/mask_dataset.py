@@ -17,7 +17,7 @@ from iwgnet_grasp.data.depth import normalise_depth
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.images import read_depth
 from iwgnet_grasp.data.jacquard import find_stems
-from iwgnet_grasp.networks.object_mask import normalise_grey
+from iwgnet_grasp.networks.object_mask import INPUT_PX, normalise_grey
 
 log = logging.getLogger(__name__)
 
@@ -81,9 +81,9 @@ class MaskDataset(Dataset):
     def __init__(
         self,
         views: MaskViews,
-        size: int,
         augmentation: Augmentation | None = None,
         seed: tuple[int, ...] = (0,),
+        size: int = INPUT_PX,
     ) -> None:
         self.views, self.size = views, size
         self.augmentation, self.seed = augmentation, seed

@@ -29,25 +29,26 @@ class GraspEstimator:
         self.max_grasps = max_grasps
         self.backend, self._predict = make_predictor(network, self.input_px, backend)
 
-    def predict(self, depth: np.ndarray, empty: np.ndarray | None = None) -> list[list[Grasp]]:
+    def predict(self, depth: np.ndarray, table: np.ndarray | None = None) -> list[list[Grasp]]:
         """Grasps of each window, best first, in the window's pixels.
 
-        depth, empty: float [N, input_px, input_px], m, invalid where not finite or <= 0; empty is
-        the same view without objects. A window without valid depth has no grasps.
+        depth: float [N, input_px, input_px], m, invalid where not finite or <= 0; table: likewise,
+        the depth of the table's plane (data.depth.normalise_depth). A window without valid depth
+        has no grasps.
         """
         depth = np.asarray(depth, np.float32)
         size = self.input_px
         if depth.ndim != 3 or depth.shape[1:] != (size, size):
             raise ValueError(f"depth windows must be [N, {size}, {size}], got {list(depth.shape)}")
-        if empty is not None and np.shape(empty) != depth.shape:
-            raise ValueError(f"empty-scene windows {list(np.shape(empty))} differ from the depth's")
+        if table is not None and np.shape(table) != depth.shape:
+            raise ValueError(f"table windows {list(np.shape(table))} differ from the depth's")
         if len(depth) == 0:
             return []
         heights = np.zeros_like(depth)
         usable = np.ones(len(depth), bool)
         for i, image in enumerate(depth):
             try:
-                heights[i] = normalise_depth(image, None if empty is None else empty[i])
+                heights[i] = normalise_depth(image, None if table is None else table[i])
                 usable[i] = valid_depth(image).any()
             except ValueError:
                 usable[i] = False

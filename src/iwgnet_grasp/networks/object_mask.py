@@ -37,9 +37,9 @@ class ObjectMask(nn.Module):
     2015) down to 1/16 of the size.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 2) -> None:
         super().__init__()
-        self.stem = conv_block(2, 16, kernel=5, stride=2)
+        self.stem = conv_block(channels, 16, kernel=5, stride=2)
         self.down_4 = nn.Sequential(conv_block(16, 32, stride=2), conv_block(32, 32))
         self.down_8 = nn.Sequential(conv_block(32, 64, stride=2), conv_block(64, 64))
         self.down_16 = nn.Sequential(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import cv2
@@ -18,6 +19,10 @@ from iwgnet_grasp.perception.types import (
 
 OUTLINE_PX = 9  # twice the width of the strip around a part that tells what lies on it
 EDGE_PX = 5  # what is narrower is the edge of an object whose mask ends a little inside it
+# From one side of a border to the other, px (down, right): masks of two objects end a little apart.
+BORDER_STEPS = ((0, 6), (6, 0), (4, 4), (-4, 4))
+MIN_PLANE_PX = 50
+PLANE_SCALE = 0.003  # m from an object's plane that leave half of a pixel's weight
 LINE_PX = 3.0  # half the width of the band between the jaws that tells whose grasp it is
 LINE_SAMPLES = 25  # along it
 
@@ -185,6 +190,41 @@ def unexplained_surfaces(
     return found
 
 
+def same_parts(alike: np.ndarray, sure: Sequence[bool], least: float) -> list[list[int]]:
+    """Pieces of what stands on the table in groups, one a part, by the piece that comes first.
+
+    alike: (K, K), how likely piece j shows the part of piece i, NaN where i was not asked; a pair's
+    likelihood is the mean of what is known of it, and likelier pairs are joined first, from `least`
+    on. Two pieces that are `sure` to be parts of their own never come into one group.
+    """
+    group = list(range(len(alike)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of pairs that nothing is known of
+        pair = np.nanmean([alike, alike.T], axis=0)
+    first, second = np.nonzero(np.triu(np.nan_to_num(pair) >= least, 1))
+    for i in np.argsort(-pair[first, second], kind="stable"):
+        a, b = sorted((group[first[i]], group[second[i]]))
+        if a != b and not (_any_sure(group, sure, a) and _any_sure(group, sure, b)):
+            group = [a if g == b else g for g in group]
+    return [[i for i, g in enumerate(group) if g == k] for k in sorted(set(group))]
+
+
+def _any_sure(group: Sequence[int], sure: Sequence[bool], which: int) -> bool:
+    return any(s for g, s in zip(group, sure, strict=True) if g == which)
+
+
+def around_all(mask: np.ndarray) -> Box:
+    """The box around all pixels of a mask (H, W) bool, which has some."""
+    return Box(*cv2.boundingRect(mask.astype(np.uint8)))
+
+
+def union(boxes: Sequence[Box]) -> Box:
+    """The box around boxes."""
+    left, top = min(b.x for b in boxes), min(b.y for b in boxes)
+    right = max(b.x + b.width for b in boxes)
+    return Box(left, top, right - left, max(b.y + b.height for b in boxes) - top)
+
+
 def _in_box(logit: np.ndarray, window: Window, box: Box) -> tuple[tuple[slice, slice], np.ndarray]:
     """The part of the image that a window and its object's box share, and the logits there."""
     rows = slice(max(box.y, window.y), min(box.y + box.height, window.y + len(logit)))
@@ -210,14 +250,57 @@ def own_share(seen: np.ndarray, mask: np.ndarray, box: Box, grasp: GraspRectangl
 
 
 def taken_away(
-    depth: np.ndarray, empty_depth: np.ndarray, owners: np.ndarray, taken: Sequence[int]
-) -> np.ndarray:
-    """The depth with the empty scene's in place of some objects' pixels and of the strip around
-    them that no other object claims: their edges."""
+    depth: np.ndarray,
+    empty_depth: np.ndarray,
+    owners: np.ndarray,
+    taken: Sequence[int],
+    step: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (m) and owners, (H, W) each, as they would be without some objects.
+
+    In place of their pixels and of the strip around them that no other object claims (their edges)
+    comes what lies beneath: the rest of an object that is seen beside them, else the empty scene.
+    An object goes on within the convex hull of what is seen of it and in its plane, where
+    that runs more than `step` (m) below what was taken.
+    """
     gone = np.isin(owners, list(taken))
     strip = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OUTLINE_PX, OUTLINE_PX))
-    edges = cv2.dilate(gone.astype(np.uint8), strip).astype(bool) & (owners == NOBODY)
-    return np.where(gone | edges, empty_depth, depth)
+    gone |= cv2.dilate(gone.astype(np.uint8), strip).astype(bool) & (owners == NOBODY)
+    left = np.where(gone, empty_depth, depth)
+    left_owners = np.where(gone, NOBODY, owners).astype(owners.dtype)
+    for i in np.unique(left_owners[left_owners != NOBODY]):
+        mine = (left_owners == i).astype(np.uint8)
+        box = around_all(mine)
+        hidden, shown = gone[box.slices], depth[box.slices]
+        points = cv2.findNonZero(mine[box.slices])
+        columns, rows = points[:, 0].T
+        hull = cv2.fillConvexPoly(np.zeros(hidden.shape, np.uint8), cv2.convexHull(points), 1)
+        row, column = np.nonzero(hull.astype(bool) & hidden)
+        plane = _plane(rows, columns, shown[rows, columns]) if len(row) else None
+        if plane is None:
+            continue
+        found = (plane[0] * row + plane[1] * column + plane[2]).astype(depth.dtype)
+        with np.errstate(invalid="ignore"):
+            lower = (found > shown[row, column] + step) | np.isnan(shown[row, column])
+            lower &= found < left[box.slices][row, column]
+        row, column = row[lower], column[lower]
+        left[box.slices][row, column] = found[lower]
+        left_owners[box.slices][row, column] = i
+    return left, left_owners
+
+
+def _plane(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
+    """(a, b, c) of depth = a row + b column + c; None where too little was measured."""
+    known = np.isfinite(depth)
+    if np.count_nonzero(known) < MIN_PLANE_PX:
+        return None
+    basis = np.column_stack([rows, columns, np.ones(len(rows))])[known]
+    target = depth[known].astype(float)
+    weight = np.ones(len(target))
+    for _ in range(4):  # its recesses and edges are not of its plane
+        plane, *_ = np.linalg.lstsq(basis * weight[:, None], target * weight, rcond=None)
+        weight = 1 / (1 + ((target - basis @ plane) / PLANE_SCALE) ** 2)
+    return plane
 
 
 def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) -> float:
@@ -233,6 +316,33 @@ def covered_share(depth: np.ndarray, mask: np.ndarray, box: Box, step: float) ->
     if not outline.any():
         return 0.0
     return float(np.mean(depth[box.slices][outline] < near[outline] - step))
+
+
+def lies_on(owners: np.ndarray, heights: np.ndarray, least: float) -> np.ndarray:
+    """[K, K] int32: along the border that objects i and j share, the pixels at which j stands
+    higher by `least` (m) less those at which i does. Above 0: j lies on i, or across it.
+
+    owners: (H, W) int, ids of 0 to K - 1, NOBODY for none; heights: (H, W) m, NaN where not
+    measured.
+    """
+    count = int(owners.max(initial=NOBODY)) + 1
+    higher = np.zeros((count, count), np.int32)
+    if count == 0:
+        return higher
+    rows, columns = np.nonzero(owners != NOBODY)
+    part = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    owners, heights = owners[part], heights[part]
+    for down, right in BORDER_STEPS:
+        here = np.s_[max(-down, 0) : len(owners) - max(down, 0), : owners.shape[1] - right]
+        there = np.s_[max(down, 0) : len(owners) + min(down, 0), right:]
+        first, second = owners[here], owners[there]
+        border = (first != second) & (first != NOBODY) & (second != NOBODY)
+        first, second = first[border], second[border]
+        with np.errstate(invalid="ignore"):
+            step = heights[there][border] - heights[here][border]
+            sign = (step > least).astype(np.int32) - (step < -least)
+        np.add.at(higher, (first, second), sign)
+    return higher - higher.T
 
 
 def centroid(mask: np.ndarray, box: Box) -> tuple[float, float, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from iwgnet_grasp.data.depth import normalise_depth
+from iwgnet_grasp.data.depth import normalise_depth, support_plane
 from iwgnet_grasp.data.grasp_rectangle import angle_between, wrap_theta
 from iwgnet_grasp.data.letterbox import Region, checked_region, region_corners
 from iwgnet_grasp.files import read_config
@@ -24,13 +23,16 @@ from iwgnet_grasp.perception.merged_depth import (
     crop_window,
     distinct_objects,
     grasp_depth,
+    lies_on,
     metres,
     object_mask,
     own_share,
     pixel_owners,
+    same_parts,
     standing,
     taken_away,
     unexplained_surfaces,
+    union,
 )
 from iwgnet_grasp.perception.rims import rim_grasps
 from iwgnet_grasp.perception.types import (
@@ -64,7 +66,7 @@ class WindowGrasps(Protocol):
     input_px: int
     backend: str
 
-    def predict(self, depth: np.ndarray, empty: np.ndarray) -> list[list[Any]]: ...
+    def predict(self, depth: np.ndarray, table: np.ndarray) -> list[list[Any]]: ...
 
 
 class WindowMasks(Protocol):
@@ -75,6 +77,17 @@ class WindowMasks(Protocol):
     backend: str
 
     def predict(self, heights: np.ndarray, greys: np.ndarray) -> np.ndarray: ...
+
+
+class SameParts(Protocol):
+    """networks.same_part.SamePartEstimator: for each patch (H, W) bool the probability (H, W) that
+    a pixel shows the same part, from heights (H, W) m and grey (H, W) uint8."""
+
+    backend: str
+
+    def predict(
+        self, heights: np.ndarray, grey: np.ndarray, patches: list[np.ndarray]
+    ) -> list[np.ndarray]: ...
 
 
 class GraspOutcomes(Protocol):
@@ -102,6 +115,11 @@ class PerceptionConfig:
     min_new_share: float
     min_new_pixels: int
     min_unexplained_pixels: int
+    same_part_weights: Path
+    same_part_backend: str
+    sure_part_score: float
+    same_part_probability: float
+    min_piece_pixels: int
     grasp_weights: Path
     grasp_backend: str
     outcome_weights: Path
@@ -124,7 +142,7 @@ class PerceptionConfig:
 
     @staticmethod
     def _of(text: dict) -> PerceptionConfig:
-        detector, masks = text["detector"], text["masks"]
+        detector, masks, pieces = text["detector"], text["masks"], text["pieces"]
         grasps, pixels = text["grasps"], text["object_pixels"]
         region = detector["region"]
         return PerceptionConfig(
@@ -140,6 +158,11 @@ class PerceptionConfig:
             min_new_share=float(masks["min_new_share"]),
             min_new_pixels=int(masks["min_new_pixels"]),
             min_unexplained_pixels=int(masks["min_unexplained_pixels"]),
+            same_part_weights=_in_package(pieces["weights"]),
+            same_part_backend=str(pieces["backend"]),
+            sure_part_score=float(pieces["sure_score"]),
+            same_part_probability=float(pieces["probability"]),
+            min_piece_pixels=int(pieces["min_pixels"]),
             grasp_weights=_in_package(grasps["weights"]),
             grasp_backend=str(grasps["backend"]),
             outcome_weights=_in_package(text["outcomes"]["weights"]),
@@ -166,11 +189,23 @@ class _View:
     empty_depth: np.ndarray
     grey: np.ndarray  # uint8
     heights: np.ndarray  # m over the empty scene, lines of missing pixels filled
+    table: np.ndarray  # m, depth of the plane that the empty scene shows in the part looked at
 
     @staticmethod
-    def of(color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray) -> _View:
+    def of(color: np.ndarray, depth: np.ndarray, empty_depth: np.ndarray, part: Box) -> _View:
         grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-        return _View(color, depth, empty_depth, grey, without_gaps(empty_depth - depth))
+        try:
+            table = support_plane(empty_depth[part.slices], (-part.y, -part.x, *depth.shape))
+        except ValueError:
+            raise PerceptionError(
+                "empty_depth: nothing was measured where the detector looks; check the region in "
+                "config/perception.yaml"
+            ) from None
+        return _View(color, depth, empty_depth, grey, without_gaps(empty_depth - depth), table)
+
+    def tables(self, windows: Sequence[Window], size: int) -> list[np.ndarray]:
+        """(size, size) of `table` for each window."""
+        return [self.table[w.y : w.y + size, w.x : w.x + size] for w in windows]
 
 
 class Perception:
@@ -183,12 +218,14 @@ class Perception:
         estimator: WindowGrasps,
         masks: WindowMasks,
         outcomes: GraspOutcomes,
+        same_part: SameParts,
     ) -> None:
         self.config = config
         self.detector = detector
         self.estimator = estimator
         self.masks = masks
         self.outcomes = outcomes
+        self.same_part = same_part
 
     @property
     def backends(self) -> dict[str, str]:
@@ -196,6 +233,7 @@ class Perception:
         return {
             "detector": self.detector.backend,
             "masks": self.masks.backend,
+            "pieces": self.same_part.backend,
             "grasps": self.estimator.backend,
             "outcomes": self.outcomes.backend,
         }
@@ -217,9 +255,9 @@ class Perception:
                     f"{name}: {image.shape[1]}x{image.shape[0]} px differs from the colour image's "
                     f"{color.shape[1]}x{color.shape[0]} px; align it to the colour camera"
                 )
-        view = _View.of(color, depth, empty_depth)
-        checked = time.perf_counter()
         part = self._looked_at(depth.shape)
+        view = _View.of(color, depth, empty_depth, part)
+        checked = time.perf_counter()
         where = standing(view.heights, empty_depth, part, self.config.min_height)
         detections = self.detector.detect(color, where)
         detected = time.perf_counter()
@@ -238,14 +276,15 @@ class Perception:
         else had moved: the empty scene stands where they were seen. Boxes and pixels of the others
         stay, their grasps are estimated anew. What the taken ones hide is not known.
         """
-        depth = taken_away(look.depth, look.empty_depth, look.owners, taken)
-        view = _View.of(look.color, depth, look.empty_depth)
+        depth, owners = taken_away(
+            look.depth, look.empty_depth, look.owners, taken, self.config.max_step
+        )
+        view = _View.of(look.color, depth, look.empty_depth, self._looked_at(depth.shape))
         left = {
             o.object_id: Detection(o.label, o.score, o.box)
             for o in look.objects
             if o.object_id not in taken
         }
-        owners = np.where(np.isin(look.owners, list(taken)), NOBODY, look.owners)
         return self._estimate(view, left, owners, {}, strict=True)
 
     def _looked_at(self, shape: tuple[int, ...]) -> Box:
@@ -263,9 +302,8 @@ class Perception:
         boxes = [detection.box for detection in detections]
         windows = [crop_window(view.depth, view.empty_depth, box, size) for box in boxes]
         heights = np.zeros((len(windows), size, size), np.float32)
-        for height, window in zip(heights, windows, strict=True):
-            with contextlib.suppress(ValueError):  # nothing measured: the brightness alone tells
-                height[:] = normalise_depth(window.depth, window.empty)
+        for height, window, table in zip(heights, windows, view.tables(windows, size), strict=True):
+            height[:] = normalise_depth(window.depth, table)
         greys = [view.grey[w.y : w.y + size, w.x : w.x + size] for w in windows]
         logits = self.masks.predict(heights, np.array(greys, np.uint8).reshape(heights.shape))
         with np.errstate(invalid="ignore"):
@@ -283,14 +321,50 @@ class Perception:
         owners = pixel_owners(
             logits[kept], [windows[i] for i in kept], [d.box for d in detections], seen.shape
         )
+        return self._whole_parts(view, detections, owners, seen)
+
+    def _whole_parts(
+        self, view: _View, detections: list[Detection], owners: np.ndarray, seen: np.ndarray
+    ) -> tuple[list[Detection], np.ndarray]:
+        """Detections and owners with one object for each part: what lies across a part leaves
+        pieces of it that no detection explains, or that two do."""
+        config = self.config
         looked_at = np.zeros_like(seen)
         part = self._looked_at(seen.shape).slices
         looked_at[part] = seen[part]
+        pieces = owners.copy()
+        known = len(detections)
+        surfaces = unexplained_surfaces(looked_at, owners, config.min_piece_pixels)
+        count = known + len(surfaces)
+        for i, (box, surface) in enumerate(surfaces, known):
+            pieces[box.slices][surface] = i
+        if count == 0:
+            return detections, owners
+        shown = np.bincount(pieces[pieces != NOBODY], minlength=count)
+        sure = [d.score >= config.sure_part_score for d in detections] + [False] * (count - known)
+        asked = [i for i in range(count) if shown[i] and not sure[i]]
+        there = pieces[part]
+        chances = self.same_part.predict(
+            view.heights[part], view.grey[part], [there == i for i in asked]
+        )
+        claimed = np.nonzero(there != NOBODY)
+        alike = np.full((count, count), np.nan)
+        for i, chance in zip(asked, chances, strict=True):
+            total = np.bincount(there[claimed], chance[claimed], count)
+            alike[i] = total / np.maximum(shown, 1)
         label = detections[0].label if detections else UNKNOWN
-        for box, surface in unexplained_surfaces(looked_at, owners, config.min_unexplained_pixels):
-            owners[box.slices][surface] = len(detections)
-            detections.append(Detection(label, 0.0, box))
-        return detections, owners
+        boxes = [d.box for d in detections] + [box for box, _ in surfaces]
+        objects: list[Detection] = []
+        number = np.full(count + 1, NOBODY, pieces.dtype)  # of each piece's object; the last: none
+        for group in same_parts(alike, sure, config.same_part_probability):
+            first = group[0]
+            if first >= known and shown[group].sum() < config.min_unexplained_pixels:
+                continue
+            number[group] = len(objects)
+            box = union([boxes[i] for i in group])
+            detection = detections[first] if first < known else Detection(label, 0.0, box)
+            objects.append(replace(detection, box=box))
+        return objects, number[pieces]
 
     def _estimate(
         self,
@@ -309,11 +383,18 @@ class Perception:
         estimates: list[list[Any]] = []
         if windows:
             estimates = self.estimator.predict(
-                np.stack([w.depth for w in windows]), np.stack([w.empty for w in windows])
+                np.stack([w.depth for w in windows]), np.stack(view.tables(windows, size))
             )
         estimated = time.perf_counter()
+        lies = lies_on(owners, view.heights, self.config.min_height)
+        covered = dict(enumerate(lies.max(axis=1, initial=0).tolist()))
         objects = tuple(
-            self._object(i, detection, window, grasps, view.depth, view.empty_depth, owners, strict)
+            replace(
+                self._object(
+                    i, detection, window, grasps, view.depth, view.empty_depth, owners, strict
+                ),
+                covered_px=covered.get(i, 0),
+            )
             for (i, detection), window, grasps in zip(
                 detections.items(), windows, estimates, strict=True
             )
@@ -415,6 +496,7 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
     from iwgnet_grasp.networks.inference import GraspEstimator
     from iwgnet_grasp.networks.object_mask import MaskEstimator
     from iwgnet_grasp.networks.pick_outcome import OutcomeEstimator
+    from iwgnet_grasp.networks.same_part import SamePartEstimator
     from iwgnet_grasp.networks.weights import WeightsError
     from iwgnet_grasp.perception.detector import Detector
 
@@ -431,9 +513,10 @@ def load_perception(path: str | Path = DEFAULT_CONFIG, backend: str = "") -> Per
         estimator = GraspEstimator(config.grasp_weights, backend or config.grasp_backend)
         masks = MaskEstimator(config.mask_weights, backend or config.mask_backend)
         outcomes = OutcomeEstimator(config.outcome_weights, backend or config.outcome_backend)
+        same_part = SamePartEstimator(config.same_part_weights, backend or config.same_part_backend)
     except (WeightsError, BackendError) as error:
         raise PerceptionError(str(error)) from error
-    return Perception(config, detector, estimator, masks, outcomes)
+    return Perception(config, detector, estimator, masks, outcomes, same_part)
 
 
 def checked_color(color: np.ndarray) -> np.ndarray:

@@ -90,6 +90,7 @@ class ObjectGrasps:
     centroid_v_px: float  # Eq. 19
     centroid_depth_m: float  # median depth of the object's pixels
     valid_pixels: int  # N of Eq. 18-19
+    covered_px: int = 0  # see merged_depth.covered_pixels
     grasps: tuple[GraspRectangle, ...] = ()
 
 

@@ -1,5 +1,6 @@
-"""`iwgnet train mask`: the network that tells an object's pixels from its neighbours'."""
+"""`iwgnet train mask`: the networks that tell a part's pixels from its neighbours'."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,25 +9,50 @@ import torch
 import typer
 from rich.progress import Progress
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from iwgnet_grasp.data.augmentation import Augmentation
 from iwgnet_grasp.data.errors import DataError
 from iwgnet_grasp.data.mask_dataset import MaskDataset, MaskViews, find_masks, load_mask_views
-from iwgnet_grasp.networks import count_parameters
-from iwgnet_grasp.networks.object_mask import INPUT_PX, NAME, ObjectMask, mask_loss
+from iwgnet_grasp.data.patch_dataset import PatchDataset
+from iwgnet_grasp.networks import count_parameters, object_mask, same_part
+from iwgnet_grasp.networks.object_mask import ObjectMask, mask_loss
 from iwgnet_grasp.networks.weights import load_state, save_weights, weights_path
 from iwgnet_grasp.training.card import describe_set
 from iwgnet_grasp.training.fitting import SmallTraining, fit, prepare
 
-AUGMENTATION = Augmentation(any_turn=False)  # which object is meant is told by its upright box
+
+@dataclass(frozen=True)
+class _Task:
+    """What the networks differ in."""
+
+    network: Callable[[], ObjectMask]
+    augmentation: Augmentation
+    dataset: Callable[..., Dataset]  # of MaskViews, augmentation and seed
+    input_px: int
+
+
+TASKS = {
+    object_mask.NAME: _Task(
+        ObjectMask,
+        Augmentation(any_turn=False),  # which object is meant is told by its upright box
+        MaskDataset,
+        object_mask.INPUT_PX,
+    ),
+    same_part.NAME: _Task(
+        lambda: ObjectMask(same_part.CHANNELS),
+        Augmentation(shift_px=0.0),
+        PatchDataset,
+        same_part.VIEW_CELLS,
+    ),
+}
 
 
 @dataclass(frozen=True)
 class MaskTrainingSettings:
     """Everything that decides the result, stored in the card."""
 
-    network: str = NAME
+    network: str = object_mask.NAME  # of TASKS
     epochs: int = 20
     batch: int = 8
     learning_rate: float = 3e-3
@@ -41,14 +67,16 @@ class MaskTraining(SmallTraining):
     def __init__(
         self, settings: MaskTrainingSettings, training: MaskViews, validation: MaskViews
     ) -> None:
-        super().__init__(settings, ObjectMask(), len(training))
+        self.task = TASKS[settings.network]
+        super().__init__(settings, self.task.network(), len(training))
         self.views, self.held_out = training, validation
 
     def train_dataloader(self) -> DataLoader:
-        return self.shuffled(lambda seed: MaskDataset(self.views, INPUT_PX, AUGMENTATION, seed))
+        task = self.task
+        return self.shuffled(lambda seed: task.dataset(self.views, task.augmentation, seed))
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(MaskDataset(self.held_out, INPUT_PX), self.settings.batch)
+        return DataLoader(self.task.dataset(self.held_out), self.settings.batch)
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
         windows, masks = batch
@@ -80,9 +108,9 @@ def train_mask_network(
     resume: bool = False,
     threads: int = 0,
 ) -> Path:
-    """Writes OUT/object-mask.safetensors and its card after the last epoch; returns the path.
+    """Writes OUT/NETWORK.safetensors and its card after the last epoch; returns the path.
 
-    DataError names data that cannot be used. `resume` goes on from LOG_DIR/object-mask/last.ckpt.
+    DataError names data that cannot be used. `resume` goes on from LOG_DIR/NETWORK/last.ckpt.
     KeyboardInterrupt when the user stops it.
     """
     prepare(settings.seed, threads)
@@ -97,12 +125,12 @@ def train_mask_network(
         validation = load_mask_views([validation_data], lambda: bar.advance(task))
     module = MaskTraining(settings, training, validation)
     if initial and not resume:
-        load_state(module.network, weights_path(initial), NAME)
-    scores = fit(module, settings.epochs, log_dir / NAME, resume)
+        load_state(module.network, weights_path(initial), settings.network)
+    scores = fit(module, settings.epochs, log_dir / settings.network, resume)
     card = {
-        "network": NAME,
+        "network": settings.network,
         "parameters": count_parameters(module.network),
-        "input_px": INPUT_PX,
+        "input_px": module.task.input_px,
         "data": {
             "training": [describe_set(folder) for folder in data],
             "samples": len(training),
@@ -110,11 +138,11 @@ def train_mask_network(
             "validation_samples": len(validation),
         },
         "training": asdict(settings) | ({"initial": initial} if initial else {}),
-        "augmentation": asdict(AUGMENTATION),
+        "augmentation": asdict(module.task.augmentation),
         "validation": {key: round(scores[f"val/{key}"], 4) for key in ("loss", "iou")},
         "torch": torch.__version__,
     }
-    return save_weights(module.network, out / f"{NAME}.safetensors", card)
+    return save_weights(module.network, out / f"{settings.network}.safetensors", card)
 
 
 def train_mask(
@@ -124,6 +152,9 @@ def train_mask(
     validation_data: Annotated[Path, typer.Option(help="Folder to validate on.")] = Path(
         "data/val"
     ),
+    network: Annotated[
+        str, typer.Option(help=f"{' or '.join(TASKS)}: of an object's box, of a part's patch.")
+    ] = object_mask.NAME,
     epochs: Annotated[int, typer.Option(min=1)] = 20,
     batch: Annotated[int, typer.Option(min=1)] = 8,
     learning_rate: Annotated[float, typer.Option(min=1e-7)] = 3e-3,
@@ -140,9 +171,11 @@ def train_mask(
     ),
     threads: Annotated[int, typer.Option(min=0, help="CPU threads of torch; 0: all.")] = 0,
 ) -> None:
-    """Train the object mask network; writes OUT/object-mask.safetensors and its card."""
+    """Train a network of masks; writes OUT/NETWORK.safetensors and its card."""
+    if network not in TASKS:
+        raise typer.BadParameter(f"no network '{network}'; known: {', '.join(TASKS)}")
     settings = MaskTrainingSettings(
-        epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed
+        network=network, epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed
     )
     try:
         weights = train_mask_network(

@@ -177,6 +177,7 @@ class InProcessCell:
             feasible,
             reason,
             quality,
+            candidate.covered_px,
         )
 
     def execute(self, target: Target, tray_slot: int) -> Outcome:

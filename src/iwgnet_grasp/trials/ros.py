@@ -234,6 +234,7 @@ class RosCell:
                     pose.feasible,
                     pose.reason or ranked.reason,
                     pose.quality,
+                    ranked.object.covered_px,
                 )
             )
         targets += [
