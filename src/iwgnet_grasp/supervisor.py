@@ -172,20 +172,19 @@ def pick_line(number: int, attempt: Attempt) -> str:
     )
 
 
-def execution_order(
-    targets: Sequence[Target], min_quality: float, max_covered_px: int
-) -> list[Target]:
+def execution_order(targets: Sequence[Target], settings: Settings) -> list[Target]:
     """The feasible targets in the order in which they are picked.
 
-    Objects that lie under others come after all that do not, least covered first: taken from
-    beneath they move what lies on them. Of the free ones those with a good grasp come as given (by
-    priority), then the doubtful ones, below min_quality, by descending quality. The paper's score
-    does not see how good a grasp is, and a doubtful one often becomes good once what lies beside
-    the object is gone.
+    Those with a good grasp come as given (by priority), then the doubtful ones, below min_quality,
+    by descending quality. The paper's score does not see how good a grasp is, and a doubtful one
+    often becomes good once what lies on or beside the object is gone.
+    With replan=once objects that lie under others come after all that do not, least covered first:
+    taken from beneath they would move what lies on them, and no look would show where to.
     """
 
     def key(target: Target) -> tuple[float, float]:
-        return max(target.covered_px, max_covered_px), -min(target.quality, min_quality)
+        covered = target.covered_px if settings.replan == "once" else 0
+        return max(covered, settings.max_covered_px), -min(target.quality, settings.min_quality)
 
     return sorted((target for target in targets if target.feasible), key=key)
 
@@ -208,7 +207,7 @@ def clear_table(
         scene_id = cell.look()
         cycle.looks += 1
         targets = cell.plan(scene_id, cycle.failed)
-        graspable = execution_order(targets, settings.min_quality, settings.max_covered_px)
+        graspable = execution_order(targets, settings)
         best = max((target.quality for target in graspable), default=0.0)
         may_push = settings.replan == "every" and pushes < settings.max_pushes
         if targets and best < settings.push_below and may_push:
@@ -258,7 +257,7 @@ def clear_table(
                 break
             targets = cell.plan(scene_id, cycle.failed, taken)
             left = [t for t in targets if t.object_id not in tried]
-            graspable = execution_order(left, settings.min_quality, settings.max_covered_px)
+            graspable = execution_order(left, settings)
         if settings.replan == "once":
             cycle.ended = "sequence_done"
             return cycle

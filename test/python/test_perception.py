@@ -429,7 +429,7 @@ def test_a_box_counts_when_its_mask_shows_what_no_better_one_does():
 def test_what_stands_there_without_a_box_is_an_object(config):
     depth = scene()
     depth[300:330, 100:200] = TOP  # 3000 px
-    depth[400:420, 100:140] = TOP  # 800 px
+    depth[400:420, 100:150] = TOP  # 1000 px
     perception = Perception(
         config, KnownBoxes(BOX), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
     )
@@ -444,18 +444,27 @@ def test_what_stands_there_without_a_box_is_an_object(config):
     assert len(perception.look(color(), depth, table()).objects) == 1
 
 
-def test_what_lies_on_both_sides_of_another_object_is_one(config):
-    depth = table()
-    depth[210:230, 270:470] = TOP
-    depth[160:280, 360:380] = TABLE - 0.04
-    upper = Box(360, 160, 20, 120)
-    perception = Perception(
-        config, KnownBoxes(upper), HighestPoint(), AllOfTheBox(), AsGood(), SameRow()
-    )
+def test_what_lies_on_both_sides_of_another_object_is_one_once_that_is_gone(config):
+    depth, _, below = crossing_bars()
+    depth[210:230, 400:410] = TABLE  # a gap, from where on the bar has a box of its own
+    upper, end = Box(320, 160, 20, 120), Box(410, 210, 60, 20)
+
+    class Doubtful(KnownBoxes):
+        def detect(self, color, where=None):
+            return [Detection("rod", 0.9, upper), Detection("rod", 0.5, end)]
+
+    perception = Perception(config, Doubtful(), HighestPoint(), AllOfTheBox(), AsGood(), SameRow())
     look = perception.look(color(), depth, table())
-    assert [(o.score, o.box) for o in look.objects] == [(0.9, upper), (0.0, Box(270, 210, 200, 20))]
-    assert [o.valid_pixels for o in look.objects] == [120 * 20, 180 * 20]
-    assert look.objects[0].covered_px == 0 and look.objects[1].covered_px > 50
+    assert [o.valid_pixels for o in look.objects] == [120 * 20, 60 * 20]  # nothing of 1500 px
+    assert [o.covered_px for o in look.objects] == [0, 0]
+    left = perception.without(look, [0])
+    (bar,) = left.objects
+    assert (bar.object_id, bar.score, bar.box) == (1, 0.5, Box(270, 210, 200, 20))
+    assert bar.valid_pixels == 190 * 20
+    below[210:230, 400:410] = TABLE
+    np.testing.assert_allclose(left.depth, below, atol=1e-4)
+    # Whoever takes one of two objects that are one part takes both.
+    assert [o.object_id for o in perception.without(look, [1]).objects] == [0]
 
 
 def test_pieces_are_joined_from_the_likeliest_pair_on():

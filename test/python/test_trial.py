@@ -136,17 +136,20 @@ def test_good_grasps_go_by_priority_and_doubtful_ones_come_last_best_first():
         Target(1, i, "connecting_rod", 0.9, 1.0 - 0.1 * i, grasp, i != 4, quality=q)
         for i, q in qualities.items()
     ]
-    assert [t.object_id for t in execution_order(targets, 0.3, 0)] == [1, 3, 2, 0]
-    assert [t.object_id for t in execution_order(targets, 0.0, 0)] == [0, 1, 2, 3]
+    for least, order in ((0.3, [1, 3, 2, 0]), (0.0, [0, 1, 2, 3])):
+        settings = load_settings(CONFIG, min_quality=least)
+        assert [t.object_id for t in execution_order(targets, settings)] == order
 
 
-def test_what_lies_under_another_object_waits_for_it():
+def test_in_a_sequence_from_one_look_what_lies_under_another_object_waits_for_it():
     grasp = GraspRectangle(10.0, 5.0, 0.1, 20.0, 0.8, 0.58)
     targets = [
         Target(1, i, "connecting_rod", 0.9, 0.5, grasp, True, quality=q, covered_px=c)
         for i, (q, c) in enumerate([(0.9, 40), (0.9, 30), (0.1, 12), (0.9, 14)])
     ]
-    assert [t.object_id for t in execution_order(targets, 0.3, 15)] == [3, 2, 1, 0]
+    for replan, order in (("once", [3, 2, 1, 0]), ("every", [0, 1, 3, 2])):
+        settings = load_settings(CONFIG, replan=replan, min_quality=0.3, max_covered_px=15)
+        assert [t.object_id for t in execution_order(targets, settings)] == order
 
 
 def test_where_no_grasp_is_good_an_object_is_pushed_aside_and_it_looks_again():

@@ -35,6 +35,7 @@ from iwgnet_grasp.perception.merged_depth import (
     union,
 )
 from iwgnet_grasp.perception.rims import rim_grasps
+from iwgnet_grasp.perception.shanks import shank_grasps
 from iwgnet_grasp.perception.types import (
     NOBODY,
     Box,
@@ -120,6 +121,7 @@ class PerceptionConfig:
     sure_part_score: float
     same_part_probability: float
     min_piece_pixels: int
+    min_part_pixels: int
     grasp_weights: Path
     grasp_backend: str
     outcome_weights: Path
@@ -129,6 +131,7 @@ class PerceptionConfig:
     min_angle_rad: float
     min_own_share: float
     rim_quality: float
+    shank_quality: float
     min_pixels: int
     min_height: float
     max_step: float
@@ -163,6 +166,7 @@ class PerceptionConfig:
             sure_part_score=float(pieces["sure_score"]),
             same_part_probability=float(pieces["probability"]),
             min_piece_pixels=int(pieces["min_pixels"]),
+            min_part_pixels=int(pieces["min_part_pixels"]),
             grasp_weights=_in_package(grasps["weights"]),
             grasp_backend=str(grasps["backend"]),
             outcome_weights=_in_package(text["outcomes"]["weights"]),
@@ -172,6 +176,7 @@ class PerceptionConfig:
             min_angle_rad=math.radians(float(grasps["min_angle_deg"])),
             min_own_share=float(grasps["min_own_share"]),
             rim_quality=float(grasps["rim_quality"]),
+            shank_quality=float(grasps["shank_quality"]),
             min_pixels=int(pixels["min_pixels"]),
             min_height=float(pixels["min_height"]),
             max_step=float(pixels["max_step"]),
@@ -273,24 +278,35 @@ class Perception:
 
     def without(self, look: Look, taken: Sequence[int]) -> Look:
         """The look as it would be once the objects with these ids had been taken away and nothing
-        else had moved: the empty scene stands where they were seen. Boxes and pixels of the others
-        stay, their grasps are estimated anew. What the taken ones hide is not known.
+        else had moved: what they lay on goes on beneath them, else the empty scene stands there.
+        The grasps of the others are estimated anew.
+
+        No other look will show what was wrong in this one: objects that show one part are joined,
+        under the first's id, and what no object explains is one as well, with an id of its own.
         """
+        part = self._looked_at(look.depth.shape)
+        view = _View.of(look.color, look.depth, look.empty_depth, part)
+        seen = {o.object_id: Detection(o.label, o.score, o.box) for o in look.objects}
+        parts, owners, became = self._whole_parts(view, seen, look.owners)
+        gone = {int(became[i]) for i in taken}
         depth, owners = taken_away(
-            look.depth, look.empty_depth, look.owners, taken, self.config.max_step
+            look.depth, look.empty_depth, owners, list(gone), self.config.max_step
         )
-        view = _View.of(look.color, depth, look.empty_depth, self._looked_at(depth.shape))
-        left = {
-            o.object_id: Detection(o.label, o.score, o.box)
-            for o in look.objects
-            if o.object_id not in taken
-        }
+        view = _View.of(look.color, depth, look.empty_depth, part)
+        left = {i: detection for i, detection in parts.items() if i not in gone}
         return self._estimate(view, left, owners, {}, strict=True)
 
     def _looked_at(self, shape: tuple[int, ...]) -> Box:
         """The detector's region in an image (H, W)."""
         left, top, right, bottom = region_corners(shape, self.detector.region)
         return Box(left, top, right - left, bottom - top)
+
+    def _only_looked_at(self, mask: np.ndarray) -> np.ndarray:
+        """A mask (H, W) without what lies outside of the detector's region."""
+        part = self._looked_at(mask.shape).slices
+        kept = np.zeros_like(mask)
+        kept[part] = mask[part]
+        return kept
 
     def _distinct(
         self, view: _View, detections: Sequence[Detection]
@@ -321,50 +337,54 @@ class Perception:
         owners = pixel_owners(
             logits[kept], [windows[i] for i in kept], [d.box for d in detections], seen.shape
         )
-        return self._whole_parts(view, detections, owners, seen)
+        looked_at = self._only_looked_at(seen)
+        label = detections[0].label if detections else UNKNOWN
+        for box, surface in unexplained_surfaces(looked_at, owners, config.min_unexplained_pixels):
+            owners[box.slices][surface] = len(detections)
+            detections.append(Detection(label, 0.0, box))
+        return detections, owners
 
     def _whole_parts(
-        self, view: _View, detections: list[Detection], owners: np.ndarray, seen: np.ndarray
-    ) -> tuple[list[Detection], np.ndarray]:
-        """Detections and owners with one object for each part: what lies across a part leaves
-        pieces of it that no detection explains, or that two do."""
+        self, view: _View, detections: dict[int, Detection], owners: np.ndarray
+    ) -> tuple[dict[int, Detection], np.ndarray, np.ndarray]:
+        """One object for each part: what lies across a part leaves pieces of it that no object has,
+        or that two have. By the first of the ids that are joined, new ones follow the known ones.
+        With whose pixel each is, and which object each of the ids has become."""
         config = self.config
-        looked_at = np.zeros_like(seen)
-        part = self._looked_at(seen.shape).slices
-        looked_at[part] = seen[part]
-        pieces = owners.copy()
         known = len(detections)
-        surfaces = unexplained_surfaces(looked_at, owners, config.min_piece_pixels)
-        count = known + len(surfaces)
+        with np.errstate(invalid="ignore"):
+            seen = self._only_looked_at(view.heights > config.min_height)
+        surfaces = unexplained_surfaces(seen, owners, config.min_piece_pixels)
+        pieces = owners.copy()
         for i, (box, surface) in enumerate(surfaces, known):
             pieces[box.slices][surface] = i
-        if count == 0:
-            return detections, owners
+        count = known + len(surfaces)
         shown = np.bincount(pieces[pieces != NOBODY], minlength=count)
-        sure = [d.score >= config.sure_part_score for d in detections] + [False] * (count - known)
+        scores = [detections[i].score for i in range(known)] + [0.0] * len(surfaces)
+        sure = [score >= config.sure_part_score for score in scores]
         asked = [i for i in range(count) if shown[i] and not sure[i]]
+        part = self._looked_at(seen.shape).slices
         there = pieces[part]
+        claimed = there != NOBODY
         chances = self.same_part.predict(
             view.heights[part], view.grey[part], [there == i for i in asked]
         )
-        claimed = np.nonzero(there != NOBODY)
         alike = np.full((count, count), np.nan)
         for i, chance in zip(asked, chances, strict=True):
             total = np.bincount(there[claimed], chance[claimed], count)
             alike[i] = total / np.maximum(shown, 1)
+        boxes = [detections[i].box for i in range(known)] + [box for box, _ in surfaces]
         label = detections[0].label if detections else UNKNOWN
-        boxes = [d.box for d in detections] + [box for box, _ in surfaces]
-        objects: list[Detection] = []
-        number = np.full(count + 1, NOBODY, pieces.dtype)  # of each piece's object; the last: none
+        parts = {}
+        became = np.full(count + 1, NOBODY, pieces.dtype)  # the last: of what is nobody's
         for group in same_parts(alike, sure, config.same_part_probability):
             first = group[0]
-            if first >= known and shown[group].sum() < config.min_unexplained_pixels:
+            if first >= known and shown[group].sum() < config.min_part_pixels:
                 continue
-            number[group] = len(objects)
+            became[group] = first
             box = union([boxes[i] for i in group])
-            detection = detections[first] if first < known else Detection(label, 0.0, box)
-            objects.append(replace(detection, box=box))
-        return objects, number[pieces]
+            parts[first] = replace(detections.get(first, Detection(label, 0.0, box)), box=box)
+        return parts, became[pieces], became
 
     def _estimate(
         self,
@@ -465,6 +485,8 @@ class Perception:
         if config.rim_quality > 0:
             heights = empty_depth[box.slices] - depth[box.slices]
             kept += rim_grasps(mask, heights, box, config.rim_quality)
+        if config.shank_quality > 0 and strict:
+            kept += shank_grasps(mask, box, config.shank_quality)
         covered = covered_share(depth, mask, box, config.max_step) / config.covered_scale
         free = math.exp(-covered * covered)
         radius = config.grasp_depth_radius_px
