@@ -260,8 +260,8 @@ def taken_away(
 
     In place of their pixels and of the strip around them that no other object claims (their edges)
     comes what lies beneath: the rest of an object that is seen beside them, else the empty scene.
-    An object goes on within the convex hull of what is seen of it and in its plane, where
-    that runs more than `step` (m) below what was taken.
+    An object goes on in its plane between the pixels of it that border on what was taken, where
+    the plane runs more than `step` (m) below that.
     """
     gone = np.isin(owners, list(taken))
     strip = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OUTLINE_PX, OUTLINE_PX))
@@ -271,11 +271,9 @@ def taken_away(
     for i in np.unique(left_owners[left_owners != NOBODY]):
         mine = (left_owners == i).astype(np.uint8)
         box = around_all(mine)
-        hidden, shown = gone[box.slices], depth[box.slices]
-        points = cv2.findNonZero(mine[box.slices])
-        columns, rows = points[:, 0].T
-        hull = cv2.fillConvexPoly(np.zeros(hidden.shape, np.uint8), cv2.convexHull(points), 1)
-        row, column = np.nonzero(hull.astype(bool) & hidden)
+        mine, shown = mine[box.slices], depth[box.slices]
+        row, column = np.nonzero(_between(mine, gone[box.slices], strip))
+        rows, columns = np.nonzero(mine)
         plane = _plane(rows, columns, shown[rows, columns]) if len(row) else None
         if plane is None:
             continue
@@ -287,6 +285,20 @@ def taken_away(
         left[box.slices][row, column] = found[lower]
         left_owners[box.slices][row, column] = i
     return left, left_owners
+
+
+def _between(mine: np.ndarray, gone: np.ndarray, strip: np.ndarray) -> np.ndarray:
+    """(H, W) bool: each piece of `gone` within the convex hull of the pixels of `mine` that border
+    on it: where it crosses a bar, the bar's width. mine: uint8; strip: what counts as bordering."""
+    between = np.zeros(gone.shape, bool)
+    count, pieces = cv2.connectedComponents(gone.astype(np.uint8))
+    for k in range(1, count):
+        piece = pieces == k
+        border = cv2.findNonZero(mine & cv2.dilate(piece.astype(np.uint8), strip))
+        if border is not None:
+            hull = cv2.fillConvexPoly(np.zeros(gone.shape, np.uint8), cv2.convexHull(border), 1)
+            between |= piece & hull.astype(bool)
+    return between
 
 
 def _plane(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray) -> np.ndarray | None:
