@@ -90,8 +90,8 @@ class ObjectGrasps:
     centroid_v_px: float  # Eq. 19
     centroid_depth_m: float  # median depth of the object's pixels
     valid_pixels: int  # N of Eq. 18-19
-    covered_px: int = 0  # see merged_depth.covered_pixels
     grasps: tuple[GraspRectangle, ...] = ()
+    covered_px: int = 0  # of the border with the object that lies on it (merged_depth.lies_on)
 
 
 @dataclass(frozen=True)
