@@ -119,7 +119,7 @@ def test_a_whole_trial_clears_the_table_and_leaves_its_results(tmp_path):
     code, text, record = trial.finish()
     assert code == (0 if record["success"] else 1)
     assert record["transport"] == "ros" and record["objects"] == 5
-    assert set(record["backends"]) == {"detector", "masks", "grasps", "outcomes"}
+    assert set(record["backends"]) == {"detector", "masks", "pieces", "grasps", "outcomes"}
     assert record["in_tray"] >= 3, text  # how many is what the trials of docs/ measure
     assert len(record["picks"]) >= 4 and record["error"] == ""
     assert {pick["look"] for pick in record["picks"]} == {1}
