@@ -30,7 +30,8 @@ def _upsample(channels_in: int, channels_out: int) -> nn.Sequential:
 
 
 class ObjectMask(nn.Module):
-    """Height and brightness [N, 2, H, W] -> logit of "the object's" [N, H, W].
+    """Height and brightness [N, 2, H, W] -> logit of "the object's" [N, H, W]; networks.same_part
+    gives it a third channel.
 
     Channel 0: data.depth.normalise_depth of the merged depth, in which neighbours outside the box
     are pits; channel 1: `normalise_grey`. H and W are multiples of 16. A U-Net (Ronneberger et al.

@@ -292,7 +292,7 @@ class Perception:
         depth, owners = taken_away(
             look.depth, look.empty_depth, owners, list(gone), self.config.max_step
         )
-        view = _View.of(look.color, depth, look.empty_depth, part)
+        view = replace(view, depth=depth, heights=without_gaps(look.empty_depth - depth))
         left = {i: detection for i, detection in parts.items() if i not in gone}
         return self._estimate(view, left, owners, {}, strict=True)
 
